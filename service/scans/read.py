@@ -10,12 +10,14 @@ from service.scans.points.planes import LocalPlanes, local_planes, robust_scatte
 from service.scans.points.ply_points import PlyPoints, read_ply_points
 from service.scans.points.rigid import nearest_rigid
 from service.scans.points.scan import Scan, Target
+from stage.capture.camera import Camera
 from stage.errors import ManifestError, ResultError
+from stage.formats import exr
 from stage.formats.ply import POINTS_FILE, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.depth_normals import depth_normals
 from stage.results.maps import MAPS_FILE, SurfaceMaps
-from stage.results.result_metadata import result_file
+from stage.results.result_metadata import camera_and_provenance, result_file
 from stage.sets.scan_set import MOST_M, UNITS_M, ScanEntry, ScanSet
 
 NORMAL_RADIUS_PX = 2
@@ -44,14 +46,26 @@ def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool
     entry = scans.scans[number]
     where = f"{file}: scans[{number}] ({entry.name})"
     path = file.parent / entry.path
-    pose = None if entry.scan_to_world is None else nearest_rigid(np.array(entry.scan_to_world, dtype=np.float64))
     covariance = None if entry.pose_covariance is None else np.array(entry.pose_covariance, dtype=np.float64)
     if path.is_file() and path.suffix.lower() == ".ply":
-        return _point_set(path, entry, where, pose, covariance, estimate_normals)
+        return _point_set(path, entry, where, _pose(entry), covariance, estimate_normals)
     if not (path / DEPTH_FILE).is_file() and not (path.is_file() and path.suffix.lower() == ".exr"):
         raise ManifestError(f"{where}: path: {path} is neither a folder with a {DEPTH_FILE} nor a PLY file")
-    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance,
-                        estimate_normals)
+    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, covariance, estimate_normals)
+
+
+def given_pose(file: Path, entry: ScanEntry) -> np.ndarray | None:
+    """Return world_from_scan [4, 4] that the set or the camera of a range image says, without reading what was measured."""
+    path = file.parent / entry.path
+    depth = path / DEPTH_FILE if path.is_dir() else path
+    if entry.scan_to_world is None and depth.suffix.lower() == ".exr" and depth.is_file():
+        return _pose(entry, camera_and_provenance(exr.read_header(depth).metadata, depth, file_name=DEPTH_FILE)[0])
+    return _pose(entry)
+
+
+def _pose(entry: ScanEntry, camera: Camera | None = None) -> np.ndarray | None:
+    matrix = entry.scan_to_world or (None if camera is None else camera.world_from_camera)
+    return None if matrix is None else nearest_rigid(np.array(matrix, dtype=np.float64))
 
 
 def targets_of(entry: ScanEntry) -> tuple[Target, ...]:
@@ -59,16 +73,14 @@ def targets_of(entry: ScanEntry) -> tuple[Target, ...]:
     return tuple(Target(target.name, np.array(target.position_m), target.sigma_m**2 * np.eye(3)) for target in entry.targets)
 
 
-def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None,
-                 estimate_normals: bool) -> Scan:
+def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, covariance: np.ndarray | None, estimate_normals: bool
+                 ) -> Scan:
     if entry.unit != "m":
         raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
     if entry.viewpoint_m is not None:
         raise ManifestError(f"{where}: viewpoint_m: {path.name} has a camera, which says where it was seen from: leave it out")
     depth = DepthMaps.read(path)
     camera = depth.camera
-    if pose is None and camera.world_from_camera is not None:
-        pose = nearest_rigid(np.array(camera.world_from_camera, dtype=np.float64))
     if camera.projection == "orthographic" and camera.pixel_size_m is None:
         raise ManifestError(f"{where}: camera.pixel_size_m of {path} is missing: scans are placed in metres")
     used = depth.mask & np.isfinite(depth.depth) & (depth.depth > 0 if camera.projection == "perspective" else True)
@@ -99,7 +111,7 @@ def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source,
                 normals=normals, normals_source=source, colours=_colours(path, depth.mask, used),
                 confidence=None if depth.confidence is None else depth.confidence.reshape(-1)[pixels].astype(np.float32), origin=origin,
-                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps, targets=targets_of(entry))
+                camera=camera, pixels=pixels, pose=_pose(entry, camera), pose_covariance=covariance, maps=maps, targets=targets_of(entry))
 
 
 def _photometric(path: Path, where: str, used: np.ndarray) -> np.ndarray:

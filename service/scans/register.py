@@ -18,7 +18,7 @@ from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.scans.points.neighbours import neighbours_are_installed
 from service.scans.points.rigid import about, applied
-from service.scans.read import read_scans
+from service.scans.read import given_pose, read_scans
 from service.scans.registration.fixed_poses import check_fixed
 from service.scans.registration.pairs import Evidence, Pair, PairState
 from service.scans.registration.registration import NoneJoinedError, RegistrationOptions, register_by
@@ -164,9 +164,7 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
                                   accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts, threads=threads)
     said += missed + _without_viewpoint(listed, known)
-    starts = _starts(request, listed, known)
-    if request.starts and sum(start is not None for start in starts) < 2:
-        raise RequestError(f"--starts: {file} has no two scans with a pose: give scan_to_world, or a turntable with angles_deg")
+    starts = _starts(request, listed, [scan.pose for scan in known])
     try:
         found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], starts, options,
                             table=table if request.turntable is TableUse.ANGLES else None,
@@ -209,6 +207,10 @@ def _checked(request: RegisterRequest, file: Path, alone: Distinct) -> int | Non
     if len(listed.scans) < 2:
         beside = f" ({'; '.join(alone.warnings())})" if alone.same_as else ""
         raise ScanError(f"{file}: scans: holds one scan: two or more are registered{beside}")
+    if request.starts:
+        starts = _starts(request, listed, [given_pose(file, entry) for entry in listed.scans])
+        if sum(start is not None for start in starts) < 2:
+            raise RequestError(f"--starts: {file} has no two scans with a pose: give scan_to_world, or a turntable with angles_deg")
     if request.reference is None:
         return None
     names = [entry.name for entry in listed.scans]
@@ -218,15 +220,15 @@ def _checked(request: RegisterRequest, file: Path, alone: Distinct) -> int | Non
     return names.index(reference)
 
 
-def _starts(request: RegisterRequest, listed: ScanSet, scans: Sequence[ScanFacts]) -> list[np.ndarray | None]:
+def _starts(request: RegisterRequest, listed: ScanSet, poses: Sequence[np.ndarray | None]) -> list[np.ndarray | None]:
     """Return the start of each scan: its pose, or else what the angle of the turntable says."""
     if request.poses is GivenPoses.IGNORED:
-        return [None] * len(scans)
+        return [None] * len(poses)
     table = listed.turntable
-    turned = [None] * len(scans) if table is None or table.angles_deg is None else [table.pose_at(angle) for angle in table.angles_deg]
+    turned = [None] * len(poses) if table is None or table.angles_deg is None else [table.pose_at(angle) for angle in table.angles_deg]
     if request.turntable is TableUse.ANGLES:
         return list(turned)
-    return [scan.pose if scan.pose is not None else start for scan, start in zip(scans, turned, strict=True)]
+    return [start if pose is None else pose for pose, start in zip(poses, turned, strict=True)]
 
 
 def _entry(entry: ScanEntry, home: Path, out: Path, pose: np.ndarray | None, covariance: np.ndarray | None) -> ScanEntry:

@@ -192,10 +192,7 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
     if rival is not None:
         return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
-    tried = _tried_out(a, b, best, cell_m, least_overlap, start, decides)
-    if tried.state is PairState.JOINED and tried.fit is not None:
-        tried = tried._replace(fit=_doubted(a.fine, b.fine, tried.fit, 1.5 * max(a.spacing, b.spacing)))
-    return tried
+    return _tried_out(a, b, best, cell_m, least_overlap, start, decides)
 
 
 def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None, held: Held | None = None
@@ -226,9 +223,10 @@ def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least
     return Pair(*numbers, state, found, overlap, against.points, reason)
 
 
-def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
+def _doubted(a: Prepared, b: Prepared, found: Fit, held: Held | None = None) -> Fit:
     """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
-    other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
+    near = [replace(cloud, normals=cloud.near_normals) for cloud in (a.fine, b.fine)]
+    other = fit(*near, found.pose, [1.5 * max(a.spacing, b.spacing)], held=held)
     return found if other is None else doubted(found, step_between(other.pose @ inverse(found.pose), found.pivot)[None])
 
 
@@ -244,13 +242,14 @@ def _at_start(a: Prepared, b: Prepared, best: Pair, start: np.ndarray, steps: np
     """Return the pair as it fits without a motion away from its start in directions that the surfaces leave open, steps [k, 6] of which
     each moves the points by about their size: there its σ is a cell, as near as starts are right."""
     assert best.fit is not None
-    found = fitted(a, b, start, cell_m, held=Held(steps, best.fit.pivot))
+    held = Held(steps, best.fit.pivot)
+    found = fitted(a, b, start, cell_m, held=held)
     if found is None:
         return best._replace(state=PairState.AMBIGUOUS, reason=words)
     pair = judged(a, b, found, (best.a, best.b), least_overlap)
     if pair.state is not PairState.JOINED:
         return pair
-    return pair._replace(fit=doubted(found, steps * (cell_m * step_units(b)[0])),
+    return pair._replace(fit=doubted(_doubted(a, b, found, held), steps * (cell_m * step_units(b)[0])),
                          reason=f"{words}: its start is taken there, as right to {1e3 * cell_m:.3g} mm")
 
 
@@ -271,7 +270,7 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
                 _stays_away(a, b, best, shift * step, shift, reach, least_overlap) for shift in shifts)):
             undetermined.append(step)
     if not undetermined:
-        return best
+        return best._replace(fit=_doubted(a, b, best.fit))
     kind = "turned about an axis" if np.linalg.norm(undetermined[0][:3]) > 0.5 else "shifted along itself"
     words = f"the surface looks the same when it is {kind}, so that its pose is not determined"
     if decides and start is not None:
