@@ -1,6 +1,7 @@
-"""Import of scans as they come, as a scan set: a folder of point files, with the poses of a Stanford .conf file where there is one, or the
-frames of a depth camera."""
+"""Import of scans as they come, as a scan set: a folder of point files, with the poses of a Stanford .conf file where there is one, the
+frames of a depth camera, or folders with results of relit depth."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +16,11 @@ from service.scans.viewpoints import LEAST_POINTS, find_viewpoints
 from stage.errors import ManifestError, ResultError, storage
 from stage.formats.ply import PointCloud, write_ply
 from stage.importers.depth_frames import DEPTH, frame_layout
-from stage.importers.guess import POINT_FILES
+from stage.importers.guess import POINT_FILES, depth_results
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
-from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, write_scan_set
+from stage.results.depth_maps import DEPTH_FILE
+from stage.results.maps import MAPS_FILE
+from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, Turntable, write_scan_set
 from stage.transforms import ROTATION_ROUNDING, off_rotation, scaled_rotation
 
 FAR_AWAY = 100.0
@@ -44,7 +47,8 @@ class _Scan(NamedTuple):
 
 
 def import_scans(request: ScansImport) -> Imported:
-    """Write a scan-set.json for the point files of a folder, and find out where the scanner stood; or for the frames of a depth camera.
+    """Write a scan-set.json for the point files of a folder, and find out where the scanner stood; for the frames of a depth camera; or
+    for results of relit depth.
 
     Files other than PLY are written as PLY.
     Raises ManifestError: there are no scans, or the file of poses is wrong; names it. Raises ResultError: a file is not what its ending
@@ -57,17 +61,17 @@ def import_scans(request: ScansImport) -> Imported:
     if metric and request.unit is not ScanUnit.M:
         raise ManifestError(f"{source / metric[0]}: E57 files are in metres: leave --unit {request.unit} out, and import other files apart")
     layout, tables = frame_layout(source), [source / name for name in listed if name.lower().endswith(".conf")]
-    path = folder / SCAN_SET_FILE
     converted = [name for name in names if not name.lower().endswith(".ply")]
     if folder == source and (converted or (layout and not names)):
         raise ManifestError(f"{source}: {converted[0] if converted else 'depth images'} are converted: give another folder for the scans")
     if layout is not None and not names:
         frames, said = write_frames(request, layout)
-        write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=tuple(frames)), path)
-        return Imported(path, tuple(said))
+        return _written(request, frames, said)
+    if not names and (results := depth_results(source)):
+        return _written(request, _result_entries(request, results), [("scans", f"{len(results)} results of relit depth")])
     if not names:
         raise ManifestError(f"{source}: holds neither point files ({', '.join(POINT_FILES)}) nor images named *{DEPTH}, nor frames of "
-                            "TUM or Redwood")
+                            f"TUM or Redwood, nor folders with a {DEPTH_FILE}")
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
@@ -80,15 +84,42 @@ def import_scans(request: ScansImport) -> Imported:
         facts.append(("origin", f"is moved to {','.join(f'{x:.0f}' for x in moved)} of the files, from which the points lie far away"))
     facts += _doubts(request, scans, sizes, any(name.lower().endswith(METRIC) for name in names))
     places = _viewpoints(request, scans, facts)
-    entries = tuple(ScanEntry.model_validate({
+    entries = [ScanEntry.model_validate({
         "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.path in names else "m",
         **({} if place is None else {"viewpoint_m": place}),
         **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})})
-        for scan, place in zip(scans, places, strict=True))
+        for scan, place in zip(scans, places, strict=True)]
     if folder != source:
         place_images(source, folder, [name for name in names if name not in converted and any(scan.path == name for scan in scans)])
-    write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=entries), path)
+    return _written(request, entries, facts)
+
+
+def _written(request: ScansImport, entries: list[ScanEntry], facts: list[tuple[str, str]]) -> Imported:
+    """Write the scan set with the turntable of the options."""
+    path, table = request.folder / SCAN_SET_FILE, None
+    if request.axis is not None and request.axis_point_m is not None:
+        angles = request.turntable
+        if angles is not None and len(angles) == 1:
+            angles = tuple(0.0 + number * angles[0] for number in range(len(entries)))
+        if angles is not None and len(angles) != len(entries):
+            raise ManifestError(f"{request.source}: has {len(entries)} scans, and --turntable {len(angles)} angles: give one for each, or "
+                                "one number, the step")
+        table = Turntable(axis_point_m=request.axis_point_m, axis=request.axis, angles_deg=angles)
+        each = [f"{entry.name} {angle:g}" for entry, angle in zip(entries, angles or (), strict=angles is not None)]
+        said = f"{', '.join(each)} degrees" if each else "its angles are not known"
+        facts = [*facts, ("table", said)]
+    write_scan_set(ScanSet(schema="relit.scan-set/1", name=request.source.resolve().name, scans=tuple(entries), turntable=table), path)
     return Imported(path, tuple(facts))
+
+
+def _result_entries(request: ScansImport, names: list[str]) -> list[ScanEntry]:
+    """Return scans of folders with a depth.exr, with the normals of the maps that a solve has written beside it."""
+    def place(name: str) -> str:
+        return Path(os.path.relpath(request.source / name, request.folder)).as_posix()
+
+    return [ScanEntry.model_validate({"name": name, "path": place(name),
+                                      **({"maps": place(name)} if (request.source / name / MAPS_FILE).is_file() else {})})
+            for name in names]
 
 
 def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) -> tuple[list[_Scan], np.ndarray | None]:

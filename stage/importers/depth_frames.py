@@ -82,8 +82,8 @@ def read_frames(folder: Path, layout: FrameLayout, poses: Path | None = None) ->
 def read_intrinsics(folder: Path) -> np.ndarray | None:
     """Return the matrix [3, 3] of the depth camera of camera-intrinsics.txt, or of a JSON with intrinsic_matrix; None without either.
     Raises ManifestError: the file is wrong, or several files differ."""
-    if (matrix := read_matrix(folder / INTRINSICS, 3)) is not None:
-        return matrix
+    if (written := read_matrix(folder / INTRINSICS, 3)) is not None:
+        return written
     found: dict[str, np.ndarray] = {}
     with storage("read", folder):
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".json" and path.is_file())
@@ -99,7 +99,7 @@ def read_intrinsics(folder: Path) -> np.ndarray | None:
         if not np.isfinite(matrix).all() or not np.array_equal(matrix[2], (0, 0, 1)) or min(matrix[0, 0], matrix[1, 1]) <= 0:
             raise ManifestError(f"{path}: intrinsic_matrix: must be fx, 0, 0, 0, fy, 0, cx, cy, 1, the columns of the matrix")
         found[path.name] = matrix
-    if len(found) > 1 and not all(np.array_equal(matrix, one) for one in found.values()):
+    if len({matrix.tobytes() for matrix in found.values()}) > 1:
         raise ManifestError(f"{folder}: {' and '.join(found)} have intrinsics that differ: keep that of the depth camera")
     return next(iter(found.values()), None)
 

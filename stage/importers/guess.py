@@ -25,6 +25,7 @@ from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
+from stage.results.depth_maps import DEPTH_FILE
 from stage.tof.raw_frames import read_array
 
 POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz", ".e57")
@@ -114,6 +115,12 @@ def _kinect(folder: Folder) -> Guess | None:
                  assumed=("the intrinsics are those of a usual device: getIrCameraParams of yours says better ones",))
 
 
+def depth_results(source: Path) -> list[str]:
+    """Return the names of the folders in a folder that are results of relit depth."""
+    with storage("read", source):
+        return natural_order(path.name for path in source.iterdir() if (path / DEPTH_FILE).is_file())
+
+
 def _scans(folder: Folder) -> Guess | None:
     if (layout := frame_layout(folder.path)) is not None:
         words: tuple[object, ...] = ("scans", folder.path)
@@ -123,6 +130,9 @@ def _scans(folder: Folder) -> Guess | None:
             assumed.append("FX,FY,CX,CY is the depth camera in pixels, of the first Kinect about 525,525,319.5,239.5")
         return made("frames of a depth camera", f"it has {layout.value}", [*words], folder.path, solve=False,
                     assumed=tuple(assumed))._replace(then="relit register SCAN_SET --out registered")
+    if not folder.pictures and len(results := depth_results(folder.path)) > 1:
+        return made("results of relit depth", f"it has {len(results)} folders with a {DEPTH_FILE}", ["scans", folder.path], folder.path,
+                    solve=False)._replace(then=f"relit register {shlex.quote(str(folder.path))} --out registered")
     clouds = [name for name in folder.names if name.lower().endswith(POINT_FILES)]
     if not clouds or folder.pictures:
         return None

@@ -1,11 +1,13 @@
 """The options of `relit import` for scans and depth images."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
+
+from pydantic import model_validator
 
 from service.requests.base.base import Choice, Commas, Role, Spelling
 from service.requests.imports.base import ImportRequest
-from stage.model import Count, Finite, Positive
+from stage.model import Count, Direction, Finite, Positive, Vector
 
 
 class ScanUnit(Choice):
@@ -19,8 +21,8 @@ class ScanUnit(Choice):
 
 
 class ScansImport(ImportRequest):
-    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS, E57) of one object scanned from several places, whose scanner is found, or the frames of a
-    depth camera, as a scan set."""
+    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS, E57) of one object scanned from several places, whose scanner is found, the frames of a
+    depth camera, or folders with results of relit depth, as a scan set."""
 
     unit: ScanUnit = ScanUnit.M
     """The unit of the coordinates."""
@@ -36,3 +38,15 @@ class ScansImport(ImportRequest):
     """Take the first of so many depth images."""
     depth_unit_m: Positive | None = None
     """Metres in one unit of a depth image; None: 0.001, of TUM's 0.0002."""
+    turntable: Annotated[tuple[Finite, ...] | None, Commas, Spelling(metavar="STEP|A,B,C")] = None
+    """How far a turntable turned between two scans, degrees, or its angle at each; None: it is not known, or there was none."""
+    axis: Annotated[Direction | None, Commas, Spelling(metavar="X,Y,Z")] = None
+    """Direction of the turntable's axis in the frame of the scans, about which it turned by the right-hand rule; None: there was none."""
+    axis_point_m: Annotated[Vector | None, Commas, Spelling(flag="--axis-point", metavar="X,Y,Z")] = None
+    """A point of the turntable's axis in the frame of the scans, metres."""
+
+    @model_validator(mode="after")
+    def _check_table(self) -> Self:
+        if (self.axis is None) != (self.axis_point_m is None) or (self.turntable is not None and self.axis is None):
+            raise ValueError("turntable: has no whole axis: give axis and axis_point_m")
+        return self

@@ -225,8 +225,8 @@ def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least
 
 def _doubted(a: Prepared, b: Prepared, found: Fit, held: Held | None = None) -> Fit:
     """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
-    near = [replace(cloud, normals=cloud.near_normals) for cloud in (a.fine, b.fine)]
-    other = fit(*near, found.pose, [1.5 * max(a.spacing, b.spacing)], held=held)
+    near_a, near_b = (replace(cloud, normals=cloud.near_normals) for cloud in (a.fine, b.fine))
+    other = fit(near_a, near_b, found.pose, [1.5 * max(a.spacing, b.spacing)], held=held)
     return found if other is None else doubted(found, step_between(other.pose @ inverse(found.pose), found.pivot)[None])
 
 

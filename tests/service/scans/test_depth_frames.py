@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import View, figure, turntable
 
 
@@ -126,3 +127,25 @@ def test_frames_of_a_depth_camera(relit, tmp_path, views):
     assert "depth images are converted" in relit.refused("import", "scans", folder)
     (folder / "camera-intrinsics.txt").write_text("1 2 3")
     assert "camera-intrinsics.txt" in relit.refused("import", "scans", folder, tmp_path / "other")
+
+
+def test_a_turntable_of_depth_results_is_written_by_options(relit, tmp_path, views):
+    """The set stands beside the results; the poses of its table are those of the views, whose object turned about +y before the camera."""
+    source = tmp_path / "results"
+    for number, view in enumerate(views):
+        DepthMaps(camera=view.camera, mask=view.mask, depth=view.depth, sigma=view.sigma).write(source / f"view{9 + number}" / "depth.exr")
+    point = np.linalg.inv(views[0].world_from_scan)[:3, 3]
+    axis = np.linalg.inv(views[0].world_from_scan)[:3, 1]
+    table = ["--axis", ",".join(map(str, axis)), "--axis-point", ",".join(map(str, point))]
+    assert "2 folders with a depth.exr" in relit.done("import", "guess", source).out
+    said = relit.done("import", "scans", source, tmp_path / "set", "--turntable", "40", *table).out
+    assert "view9 0, view10 40 degrees" in said
+    file, scans = read_scan_set(tmp_path / "set")
+    assert [(file.parent / scan.path).resolve() for scan in scans.scans] == [source / "view9", source / "view10"]
+    assert scans.turntable is not None and scans.turntable.angles_deg is not None
+    truth = np.linalg.inv(views[0].world_from_scan) @ views[1].world_from_scan
+    assert scans.turntable.pose_at(scans.turntable.angles_deg[1]) == pytest.approx(truth, abs=1e-9)
+    relit.done("import", "scans", source, tmp_path / "open", *table)
+    assert read_scan_set(tmp_path / "open")[1].turntable.angles_deg is None
+    assert "3 angles" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "0,1,2", *table)
+    assert "axis" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "40")
