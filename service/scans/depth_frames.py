@@ -17,8 +17,8 @@ from stage.formats.images import read_recorded
 from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
 from stage.importers.depth_frames import INTRINSICS, FrameLayout, read_frames, read_intrinsics
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
-from stage.sets.scan_set import ScanEntry
-from stage.transforms import OPENCV_FROM_CAMERA, ROTATION_ROUNDING, off_rotation
+from stage.sets.scan_set import MOST_OFF_ROTATION, ScanEntry
+from stage.transforms import OPENCV_FROM_CAMERA, ROTATION_ROUNDING, off_rotation, rigid_fault
 
 NONE = (0, 65535)
 """Values of a depth image that are no depth."""
@@ -61,6 +61,8 @@ def write_frames(request: ScansImport, layout: FrameLayout) -> tuple[list[ScanEn
             write_ply(PointCloud(camera.points(-maps.depth)[kept].astype(np.float32), colours), request.folder / frame.name / POINTS_FILE)
         pose = frame.pose
         if pose is not None:
+            if (fault := rigid_fault(pose, MOST_OFF_ROTATION)) is not None:
+                raise ManifestError(f"{frame.depth}: its pose {fault}")
             turned = max(turned, off_rotation(pose))
             pose = nearest_rigid(pose)
             pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_CAMERA

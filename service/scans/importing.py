@@ -15,13 +15,13 @@ from service.scans.points.rigid import nearest_rigid
 from service.scans.viewpoints import LEAST_POINTS, find_viewpoints
 from stage.errors import ManifestError, ResultError, storage
 from stage.formats.ply import PointCloud, write_ply
-from stage.importers.depth_frames import DEPTH, frame_layout
+from stage.importers.depth_frames import DEPTH, frame_layout, pose_of
 from stage.importers.guess import POINT_FILES, depth_results
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
 from stage.results.depth_maps import DEPTH_FILE
 from stage.results.maps import MAPS_FILE
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, Turntable, write_scan_set
-from stage.transforms import ROTATION_ROUNDING, off_rotation, scaled_rotation
+from stage.transforms import ROTATION_ROUNDING, off_rotation
 
 FAR_AWAY = 100.0
 """Coordinates of more than so many times the size of a scan are counted from another origin."""
@@ -221,14 +221,10 @@ def _conf_poses(path: Path) -> dict[str, np.ndarray]:
         words = line.split()
         if words[0] not in ("bmesh", "mesh"):
             continue
-        try:
-            values = np.array([float(word) for word in words[2:9]])
-        except ValueError:
-            values = np.empty(0)
-        if len(words) != 9 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > 0.01:
+        pose = pose_of(words[2:])
+        if pose is None:
             raise ManifestError(f"{path}: line {number}: must be {words[0]} FILE tx ty tz qx qy qz qw, with a quaternion of length 1")
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = scaled_rotation(values[3:]).T, values[:3]
+        pose[:3, :3] = pose[:3, :3].T
         poses[words[1]] = pose
     if not poses:
         raise ManifestError(f"{path}: names no scans in lines of bmesh")

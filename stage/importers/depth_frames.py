@@ -8,6 +8,7 @@
 
 All poses are those of cameras with the axes of OpenCV, and centres of pixels have whole numbers."""
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,8 @@ import numpy as np
 
 from stage.errors import ManifestError, storage
 from stage.importers.layout import image_names, natural_order, read_json, read_lines
-from stage.transforms import scaled_rotation
+from stage.sets.scan_set import MOST_OFF_ROTATION
+from stage.transforms import rigid_fault, scaled_rotation
 
 DEPTH = ".depth.png"
 INTRINSICS = "camera-intrinsics.txt"
@@ -25,8 +27,6 @@ TUM_APART_S = 0.02
 """Images and poses that belong together are at most so far apart, seconds."""
 COLOUR_FOLDERS = ("color", "image", "rgb")
 TRAJECTORY = "trajectory.log"
-QUATERNION = 0.01
-"""Lengths of quaternions differ from 1 by at most this."""
 
 
 class FrameLayout(StrEnum):
@@ -104,6 +104,19 @@ def read_intrinsics(folder: Path) -> np.ndarray | None:
     return next(iter(found.values()), None)
 
 
+def pose_of(words: Sequence[str]) -> np.ndarray | None:
+    """Return the pose [4, 4] of tx ty tz qx qy qz qw, stretched as its quaternion; None if it is no rotation and translation."""
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        return None
+    if len(values) != 7 or not np.isfinite(values).all() or not values[3:].any():
+        return None
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = scaled_rotation(values[3:]), values[:3]
+    return pose if rigid_fault(pose, MOST_OFF_ROTATION) is None else None
+
+
 def read_matrix(path: Path, size: int) -> np.ndarray | None:
     """Return a matrix of numbers in a text file, or None where there is no file."""
     return _matrix(path, [line for _, line in read_lines(path)], size) if path.is_file() else None
@@ -128,11 +141,16 @@ def _tum(folder: Path, poses: Path | None) -> list[Frame]:
     colour_times, colours = _timed(folder / TUM_COLOURS, 1) if (folder / TUM_COLOURS).is_file() else (np.empty(0), [])
     table = poses or folder / TUM_POSES
     pose_times, rows = _timed(table, 7) if table.is_file() or poses else (np.empty(0), [])
+    placed = []
+    for row in rows:
+        placed.append(pose_of(row))
+        if placed[-1] is None:
+            raise ManifestError(f"{table}: {' '.join(row)}: must be tx ty tz qx qy qz qw, with a quaternion of length 1")
     frames = []
     for time, (name,) in zip(times, files, strict=True):
         colour, pose = _nearest(colour_times, time), _nearest(pose_times, time)
         frames.append(Frame(Path(name).stem, folder / name, None if colour is None else folder / colours[colour][0],
-                            None if pose is None else _posed(table, rows[pose])))
+                            None if pose is None else placed[pose]))
     return frames
 
 
@@ -161,18 +179,6 @@ def _nearest(times: np.ndarray, time: float) -> int | None:
     """Return the number of the time nearest to one, or None if none is near."""
     number = int(np.abs(times - time).argmin()) if len(times) else 0
     return number if len(times) and abs(times[number] - time) <= TUM_APART_S else None
-
-
-def _posed(path: Path, words: list[str]) -> np.ndarray:
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.full(7, np.nan)
-    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > QUATERNION:
-        raise ManifestError(f"{path}: {' '.join(words)}: must be tx ty tz qx qy qz qw, with a quaternion of length 1")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = scaled_rotation(values[3:]), values[:3]
-    return pose
 
 
 def _redwood(folder: Path, poses: Path | None) -> list[Frame]:

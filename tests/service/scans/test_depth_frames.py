@@ -125,6 +125,8 @@ def test_frames_of_a_depth_camera(relit, tmp_path, views):
         points, truth = depth.camera.points(-depth.depth), view.camera.points(-view.true_depth)
         assert np.abs(points - truth)[depth.mask].max() < 0.001
     assert "depth images are converted" in relit.refused("import", "scans", folder)
+    np.savetxt(folder / "f1.pose.txt", np.diag([1.001, 1, 1, 1]))
+    assert "f1.depth.png: its pose is not a rotation" in relit.refused("import", "scans", folder, tmp_path / "stretched")
     (folder / "camera-intrinsics.txt").write_text("1 2 3")
     assert "camera-intrinsics.txt" in relit.refused("import", "scans", folder, tmp_path / "other")
 
