@@ -11,9 +11,9 @@ from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
 from service.calibrate.results import digits, manifests_to_replace, write_results
+from service.calibrate.solvers.charuco import Charuco, charuco_of, find_board
 from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, inside_board
 from service.calibrate.solvers.laser_step import fit_step
-from service.calibrate.solvers.procam import find_corners
 from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.laser.laser import ambient_light
@@ -104,7 +104,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
     boards = []
     timings.stage("boards", len(captures))
     for number, capture in enumerate(captures, start=1):
-        plane_rms, found = _stripes_on_board(capture, request.board, request.square_m, device)
+        plane_rms, found = _stripes_on_board(capture, request.board, request.square_m, charuco_of(request), device)
         boards.append({"capture": str(capture.folder), "rms_px": round(plane_rms, 4), "stripes": sum(len(one) > 0 for one in found)})
         for index, points in enumerate(found):
             if len(points):
@@ -127,16 +127,17 @@ def _laser_frames(capture: Capture) -> list[Frame]:
     return [frame for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane)]
 
 
-def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, device: str) -> tuple[float, list[np.ndarray]]:
+def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, charuco: Charuco | None,
+                      device: str) -> tuple[float, list[np.ndarray]]:
     """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
     correction = Correction.of(capture)
     grey, black = _even_light(capture, correction), _uniform(capture, correction, "black")
     if grey is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none shows the board without the laser: add one under a white "
                             'projection, or under the light of the room, {"type": "off"}')
-    corners = find_corners(grey, board)
-    if corners is None:
-        raise CalibrationError(f"{capture.folder}: the board of {board[0]}x{board[1]} inner corners is not found")
+    corners = find_board(grey, board, charuco)
+    if isinstance(corners, str):
+        raise CalibrationError(f"{capture.folder}: {corners}")
     plane = board_plane(corners, board, square_m, capture.camera)
     inside = inside_board(corners, board, grey.shape)
     dark = np.float32(0) if black is None else black

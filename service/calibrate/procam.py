@@ -10,7 +10,8 @@ from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.calibrate.solvers.procam import BoardView, Lens, ProCam, calibrate, find_corners, outliers, projector_corners
+from service.calibrate.solvers.charuco import charuco_of, find_board
+from service.calibrate.solvers.procam import BoardView, Lens, ProCam, calibrate, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
@@ -27,7 +28,7 @@ from stage.stack.pattern_exposures import JoinedExposures, frames_shown
 from stage.stack.planes import frame_planes
 
 LEAST_CORNERS = 0.5
-"""Part of the board's corners that must be found by camera and projector, for a view to count."""
+"""Part of the corners that the camera sees which must be found in the projector, for a view to count."""
 
 
 class ProcamResult(NamedTuple):
@@ -99,9 +100,9 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
     if scene is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame, no inverses and no phases: "
                             "the board must be seen evenly lit")
-    corners = find_corners(scene @ np.array(GREY_WEIGHTS, np.float32), request.board)
-    if corners is None:
-        return f"the board of {request.board[0]}x{request.board[1]} inner corners is not found"
+    corners = find_board(scene @ np.array(GREY_WEIGHTS, np.float32), request.board, charuco_of(request))
+    if isinstance(corners, str):
+        return corners
     shape = (capture.camera.height, capture.camera.width)
     u, v, decoded = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
     options = DepthRequest.model_fields
@@ -117,8 +118,9 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
             decoded[band] = np.logical_and(*(np.isin(axis.status.numpy()[:count], SOLVED).reshape(part) for axis in (first, second)))
     lit = projector_corners(corners, u, v, decoded, request.board)
     kept = np.flatnonzero(np.isfinite(lit).all(axis=-1))
-    if len(kept) < LEAST_CORNERS * len(corners):
-        return f"only {len(kept)} of {len(corners)} corners are decoded around"
+    seen = int(np.isfinite(corners).all(axis=-1).sum())
+    if len(kept) < LEAST_CORNERS * seen:
+        return f"only {len(kept)} of {seen} corners are decoded around"
     return BoardView(str(capture.folder), corners[kept], lit[kept], kept)
 
 

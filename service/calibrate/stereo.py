@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.calibrate.solvers.procam import LEAST_VIEWS, LENS_FLAGS, Lens, board_points, find_corners, lens_of
+from service.calibrate.solvers.charuco import LEAST_SEEN, charuco_of, find_board
+from service.calibrate.solvers.procam import LEAST_VIEWS, LENS_FLAGS, Lens, board_points, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
 from stage.capture.camera import Camera, OtherCamera
@@ -57,14 +58,21 @@ def alike_order(first: np.ndarray, other: np.ndarray) -> np.ndarray:
     return other if (first[-1] - first[0]) @ (other[-1] - other[0]) >= 0 else other[::-1]
 
 
+def _seen_by_both(first: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.asarray(np.isfinite(first).all(axis=-1) & np.isfinite(other).all(axis=-1))
+
+
 def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square_m: float, size: Resolution, name: str) -> Lens:
-    """Calibrate one camera from the image coordinates of all corners of the board in each view, [corners, 2]."""
+    """Calibrate one camera from the image coordinates of all corners of the board in each view, [corners, 2], NaN where
+    one is not seen."""
     if len(corners) < LEAST_VIEWS:
         raise CalibrationError(f"{name}: {len(corners)} of the views show the board: give {LEAST_VIEWS} or more, the board tilted "
                                "differently in each")
-    points = [board_points(board, square_m)] * len(corners)
+    every, seen = board_points(board, square_m), [np.isfinite(view).all(axis=-1) for view in corners]
+    points = [every[kept] for kept in seen]
+    shown = [view[kept].astype(np.float32) for view, kept in zip(corners, seen, strict=True)]
     try:
-        rms, k, d, _, _ = cv2.calibrateCamera(points, [view.astype(np.float32) for view in corners], size, None, None, flags=LENS_FLAGS)
+        rms, k, d, _, _ = cv2.calibrateCamera(points, shown, size, None, None, flags=LENS_FLAGS)
     except cv2.error as error:
         raise CalibrationError(f"{name}: the poses of the board do not determine the camera ({str(error.err).strip().lower()}): tilt it "
                                "differently from view to view") from error
@@ -77,12 +85,15 @@ def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square
 
 def calibrate_pose(views: Sequence[SharedView], board: tuple[int, int], square_m: float, first: Lens, other: Lens, size: Resolution,
                    name: str) -> StereoPose:
-    """Find where another camera stands, from three views or more of the whole board; `size` is that of the first camera's images."""
+    """Find where another camera stands, from three views or more of the corners that both see; `size` is that of the first camera's
+    images."""
     if len(views) < LEAST_VIEWS:
         raise CalibrationError(f"{name}: {len(views)} of the views show the board to it and to the first camera: give {LEAST_VIEWS} or "
                                "more")
-    points = [board_points(board, square_m)] * len(views)
-    seen, also = [view.first.astype(np.float32) for view in views], [view.other.astype(np.float32) for view in views]
+    every, kept = board_points(board, square_m), [_seen_by_both(view.first, view.other) for view in views]
+    points = [every[both] for both in kept]
+    seen = [view.first[both].astype(np.float32) for view, both in zip(views, kept, strict=True)]
+    also = [view.other[both].astype(np.float32) for view, both in zip(views, kept, strict=True)]
     stop = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9
     rms, _, _, _, _, rotation, translation, _, _, _, _, errors = cv2.stereoCalibrateExtended(
         points, seen, also, *_matrices(first), *_matrices(other), size, np.eye(3), np.zeros((3, 1)), flags=cv2.CALIB_FIX_INTRINSIC,
@@ -110,10 +121,10 @@ class StereoResult(NamedTuple):
 
 
 class BoardFrame(NamedTuple):
-    """The corners that each camera sees in one frame; None where it does not see them all."""
+    """The corners that each camera sees in one frame, or why it sees none."""
 
     name: str
-    corners: tuple[np.ndarray | None, ...]  # [corners, 2] of the first camera and of each other one
+    corners: tuple[np.ndarray | str, ...]  # [corners, 2] of the first camera and of each other one
 
 
 def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> StereoResult:
@@ -134,16 +145,18 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
     for frame in frames:
         assert frame.stereo is not None  # chosen so
         names = frame.image, *frame.stereo.images
-        found.append(BoardFrame(frame.image, tuple(_corners(capture, name, request.board) for name in names)))
+        found.append(BoardFrame(frame.image, tuple(_corners(capture, name, request) for name in names)))
         timings.advance(len(found))
     timings.stage("fit", 1)
     cameras = capture.manifest.other_cameras
     named = [(capture.camera.resolution, "the camera"), *((other.resolution, other.name) for other in cameras)]
-    lenses = [calibrate_lens([corners for frame in found if (corners := frame.corners[number]) is not None], request.board,
+    for number, (_, name) in enumerate(named):
+        reasons = [corners for frame in found if isinstance(corners := frame.corners[number], str)]
+        if len(reasons) == len(found):
+            raise CalibrationError(f"{name}: 0 of the views show the board: {reasons[0]}")
+    lenses = [calibrate_lens([corners for frame in found if not isinstance(corners := frame.corners[number], str)], request.board,
                              request.square_m, size, name) for number, (size, name) in enumerate(named)]
-    shared = [[SharedView(frame.name, first, alike_order(first, theirs)) for frame in found
-               if (first := frame.corners[0]) is not None and (theirs := frame.corners[number]) is not None]
-              for number in range(1, len(named))]
+    shared = [[view for frame in found if (view := _shared(frame, number, request)) is not None] for number in range(1, len(named))]
     poses = [calibrate_pose(views, request.board, request.square_m, lenses[0], lens, capture.camera.resolution, other.name)
              for views, lens, other in zip(shared, lenses[1:], cameras, strict=True)]
     timings.close()
@@ -161,10 +174,20 @@ def _check_cameras(target: Capture, capture: Capture) -> None:
                             "for the same cameras")
 
 
-def _corners(capture: Capture, name: str, board: tuple[int, int]) -> np.ndarray | None:
-    """Return the corners of the board in an image, None where they are not all found."""
+def _shared(frame: BoardFrame, number: int, request: StereoRequest) -> SharedView | None:
+    """Return the corners of a frame that the first camera and another one see; None where these are too few."""
+    first, theirs = frame.corners[0], frame.corners[number]
+    if isinstance(first, str) or isinstance(theirs, str):
+        return None
+    if request.markers is None:
+        theirs = alike_order(first, theirs)
+    return SharedView(frame.name, first, theirs) if _seen_by_both(first, theirs).sum() >= LEAST_SEEN else None
+
+
+def _corners(capture: Capture, name: str, request: StereoRequest) -> np.ndarray | str:
+    """Return the corners of the board in an image, or why there are none."""
     linear = linearise(capture.recorded_whole(name), capture.manifest.color_space)
-    return find_corners(linear @ np.array(GREY_WEIGHTS, np.float32), board)
+    return find_board(linear @ np.array(GREY_WEIGHTS, np.float32), request.board, charuco_of(request))
 
 
 def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ...], lenses: list[Lens], poses: list[StereoPose],

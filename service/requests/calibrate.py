@@ -6,7 +6,7 @@ from typing import Annotated, Any, NoReturn, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from service.requests.base.base import CAPTURE, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from service.requests.base.base import CAPTURE, Choice, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
 
 
@@ -23,6 +23,13 @@ IMAGES = Spelling(argument=True, metavar="IMAGE...")
 POSES = Spelling(argument=True, metavar="CAPTURE...")
 LEAST_GREYS = 3
 """The fewest images of evenly grey projections that a response is fitted to."""
+
+
+class Markers(Choice):
+    """A set of coded markers: of ArUco by the side of its grid, or an AprilTag family."""
+
+    ARUCO4, ARUCO5, ARUCO6, ARUCO7 = "aruco4", "aruco5", "aruco6", "aruco7"
+    APRILTAG16H5, APRILTAG25H9, APRILTAG36H11 = "apriltag16h5", "apriltag25h9", "apriltag36h11"
 
 
 class Circle(Options):
@@ -79,6 +86,7 @@ def _in_metres(given_m: float | None, *, option: str, what: str) -> Any:
 
 
 SquareSide = AfterValidator(partial(_in_metres, option="--square-m", what="a square of a chessboard"))
+MarkerSide = AfterValidator(partial(_in_metres, option="--marker-m", what="a marker"))
 StepHeight = AfterValidator(partial(_in_metres, option="--step-m", what="a step"))
 
 
@@ -223,13 +231,38 @@ class SaturationRequest(ManifestRequest):
     """Set `saturation` in the manifest, in place of only printing it; `out` sets it too."""
 
 
-class BoardOptions(Options):
-    """Corners and squares of the chessboard."""
+class MarkerOptions(Options):
+    """The markers of a ChArUco board."""
+
+    markers: Markers | None = None
+    """Set of the coded markers in the white squares of a ChArUco board, which may be seen in part. None: it is a plain chessboard."""
+    marker_m: Annotated[Positive | None, MarkerSide] = None
+    """Side of a marker in metres, its black border included."""
+
+    def check_markers(self, square_m: float | None) -> None:
+        """Refuse markers without a side, without a board, or wider than its squares."""
+        if (self.markers is None) != (self.marker_m is None):
+            _refuse("--markers and --marker-m belong together: give both for a ChArUco board, or neither for a chessboard")
+        if self.marker_m is None:
+            return
+        if square_m is None:
+            _refuse("--markers are printed on a board: give --board and --square-m")
+        if self.marker_m >= square_m:
+            _refuse(f"--marker-m {self.marker_m:g}: is not smaller than the squares (--square-m {square_m:g}), in which the markers lie")
+
+
+class BoardOptions(MarkerOptions):
+    """Corners and squares of the chessboard or ChArUco board."""
 
     board: Annotated[tuple[Corners, Corners], BeforeValidator(board_corners), Spelling(metavar="9x6")]
-    """Inner corners of the chessboard, across and down."""
+    """Inner corners of the board, across and down: one fewer than its squares."""
     square_m: Annotated[Positive, SquareSide]
     """Side of a square in metres."""
+
+    @model_validator(mode="after")
+    def _markers_fit(self) -> Self:
+        self.check_markers(self.square_m)
+        return self
 
 
 class ProcamOptions(BoardOptions):
@@ -259,13 +292,13 @@ class StereoRequest(BoardOptions):
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
 
 
-class LaserPlanesOptions(Options):
-    """The target under the stripes of the laser: a chessboard, or a step."""
+class LaserPlanesOptions(MarkerOptions):
+    """The target under the stripes of the laser: a chessboard or ChArUco board, or a step."""
 
     board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
-    """Inner corners of the chessboard, across and down."""
+    """Inner corners of the board, across and down: one fewer than its squares."""
     square_m: Annotated[Positive | None, SquareSide] = None
-    """Side of a square of the chessboard in metres."""
+    """Side of a square of the board in metres."""
     step_m: Annotated[Positive | None, StepHeight] = None
     """Height in metres of a right-angled block on a flat base, which needs no board."""
 
@@ -275,6 +308,7 @@ class LaserPlanesOptions(Options):
             _refuse("--board and --square-m belong together: give both, or --step-m")
         if (self.board is None) == (self.step_m is None):
             _refuse("give --board and --square-m for a chessboard, or --step-m for a step of known height")
+        self.check_markers(self.square_m)
         return self
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from service.requests.base.base import Choice, Commas, DeviceRequest, Options, Role, Spelling
-from service.requests.calibrate import Corners, board_corners
+from service.requests.calibrate import Corners, Markers, board_corners
 from stage.model import Finite, Fraction, Line, NotNegative, Positive
 
 Unit = Literal["m", "cm", "mm", "um", "in"]
@@ -25,13 +25,6 @@ class TableUse(Choice):
     START = "start", "its angles give the starts of all poses, which then move freely"
     ANGLES = "angles", "the axis is right, and only the angles are found"
     FIXED = "fixed", "axis and angles are right: nothing is moved, and the report says what the surfaces say of it"
-
-
-class Markers(Choice):
-    """The set of coded markers that lie among the scanned."""
-
-    ARUCO4, ARUCO5, ARUCO6, ARUCO7 = "aruco4", "aruco5", "aruco6", "aruco7"
-    APRILTAG16H5, APRILTAG25H9, APRILTAG36H11 = "apriltag16h5", "apriltag25h9", "apriltag36h11"
 
 
 class Accepted(Choice):

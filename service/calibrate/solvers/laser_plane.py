@@ -52,10 +52,13 @@ class LightPlane(NamedTuple):
 
 
 def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
-    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row. `board`: its inner corners across and
+    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row, NaN where one is not
+    seen. `board`: its inner corners across and
     down. `camera`: a calibrated perspective one."""
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
-    points = np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m
+    seen_corners = np.isfinite(corners).all(axis=-1)
+    corners = corners[seen_corners]
+    points = (np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m)[seen_corners]
     x, y = camera.plane_at(corners[:, 0], corners[:, 1])
     seen = np.stack([x, -y], axis=1)  # lens distortion is undone, OpenCV's y is down
     found, turn, shift = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
@@ -71,11 +74,12 @@ def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, ca
 
 
 def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
-    """Return which pixels lie within the outer of the inner corners of a board, [rows, cols] bool."""
-    grid = corners.reshape(board[1], board[0], 2)
-    outline = np.concatenate([grid[0], grid[1:, -1], grid[-1, -2::-1], grid[-2:0:-1, 0]]) - 0.5
+    """Return which pixels lie within squares of the board whose four corners are seen, [rows, cols] bool."""
+    grid = corners.reshape(board[1], board[0], 2) - 0.5
+    squares = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2).reshape(-1, 4, 2)
     filled = np.zeros(shape, np.uint8)
-    cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], (1,))
+    for square in squares[np.isfinite(squares).all(axis=(1, 2))]:
+        cv2.fillConvexPoly(filled, np.rint(square).astype(np.int32), (1,))
     return filled.astype(bool)
 
 

@@ -85,22 +85,31 @@ def find_corners(image: np.ndarray, board: tuple[int, int]) -> np.ndarray | None
         found, corners = cv2.findChessboardCorners(shown, board, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
         return None
-    # the finder alone is accurate to 0.2 pixels, the saddle point of the grey values to 0.1 pixels even without blur
-    window = int(np.clip(SADDLE_OF_SPACING * _spacing(np.asarray(corners).reshape(board[1], board[0], 2)), *SADDLE_PX))
+    return refined(shown, np.asarray(corners).reshape(-1, 2), board, SADDLE_OF_SPACING)
+
+
+def refined(shown: np.ndarray, corners: np.ndarray, board: tuple[int, int], window_of_spacing: float) -> np.ndarray:
+    """Return the image coordinates [corners, 2] of the saddle points of the grey values beside corners in OpenCV's pixels; NaN stays."""
+    # the finders alone are accurate to 0.2 pixels, the saddle point of the grey values to 0.1 pixels even without blur
+    window = int(np.clip(window_of_spacing * _spacing(corners.reshape(board[1], board[0], 2)), *SADDLE_PX))
     stop = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4
-    corners = cv2.cornerSubPix(shown, corners, (window, window), (-1, -1), stop)
-    return np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5
+    seen = np.isfinite(corners).all(axis=-1)
+    result = np.full(corners.shape, np.nan)
+    start = corners[seen].astype(np.float32).reshape(-1, 1, 2)
+    result[seen] = cv2.cornerSubPix(shown, start, (window, window), (-1, -1), stop).reshape(-1, 2) + 0.5
+    return result
 
 
 def projector_corners(corners: np.ndarray, u: np.ndarray, v: np.ndarray, decoded: np.ndarray, board: tuple[int, int]) -> np.ndarray:
     """Return the corners of the board in the image of the projector, by a homography around each corner.
-    `corners`: [corners, 2] image coordinates of the camera. `u`, `v`: [rows, cols] decoded projector coordinates. `decoded`: [rows, cols]
-    bool, True where both coordinates are decoded. Returns [corners, 2] projector coordinates; NaN where too few pixels around a corner are
-    decoded, or they fit no homography."""
+    `corners`: [corners, 2] image coordinates of the camera, NaN where one is not seen. `u`, `v`: [rows, cols] decoded projector
+    coordinates. `decoded`: [rows, cols] bool, True where both coordinates are decoded. Returns [corners, 2] projector coordinates; NaN
+    where too few pixels around a corner are decoded, or they fit no homography."""
     result = np.full(corners.shape, np.nan)
     grid = corners.reshape(board[1], board[0], 2)
     reach = int(np.clip(REACH_OF_SPACING * _spacing(grid), *REACH_PX))
-    for index, (x, y) in enumerate(corners):
+    for index in np.flatnonzero(np.isfinite(corners).all(axis=-1)):
+        x, y = corners[index]
         row, col = int(y), int(x)
         top, left = max(row - reach, 0), max(col - reach, 0)
         box = slice(top, row + reach + 1), slice(left, col + reach + 1)
@@ -159,8 +168,8 @@ def outliers(found: ProCam) -> np.ndarray:
 
 
 def _spacing(grid: np.ndarray) -> float:
-    """Return the median distance in pixels between neighbouring corners of a grid [rows, cols, 2]."""
-    return float(np.median(np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])))
+    """Return the median distance in pixels between neighbouring corners of a grid [rows, cols, 2]; NaN is left out."""
+    return float(np.nanmedian(np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])))
 
 
 def lens_of(k: np.ndarray, d: np.ndarray, rms: float) -> Lens:

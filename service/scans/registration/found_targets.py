@@ -12,15 +12,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from service.calibrate.solvers.charuco import DICTIONARIES
 from service.calibrate.solvers.procam import eight_bits, find_corners
 from service.scans.points.scan import Scan, Target
 from stage.spread import MAD_TO_SIGMA
 
-DICTIONARIES = {
-    "aruco4": cv2.aruco.DICT_4X4_1000, "aruco5": cv2.aruco.DICT_5X5_1000, "aruco6": cv2.aruco.DICT_6X6_1000,
-    "aruco7": cv2.aruco.DICT_7X7_1000, "apriltag16h5": cv2.aruco.DICT_APRILTAG_16h5, "apriltag25h9": cv2.aruco.DICT_APRILTAG_25h9,
-    "apriltag36h11": cv2.aruco.DICT_APRILTAG_36h11}
-"""The sets of markers; a smaller ArUco set of the same grid is the beginning of that with 1000."""
 SADDLE_PX, CORNER_PX = 0.1, 0.2
 """Standard deviations of the image points of chessboard corners, and of the corners of markers, which are no saddle points."""
 MOST_AVERAGED = 25.0

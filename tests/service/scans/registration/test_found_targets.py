@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from service.calibrate.solvers.charuco import DICTIONARIES
 from service.scans.points.rigid import applied, inverse, step_between
 from service.scans.points.scan import Scan, Target
-from service.scans.registration.found_targets import DICTIONARIES, board_in, markers_in, placed
+from service.scans.registration.found_targets import board_in, markers_in, placed
 from service.scans.registration.target_pairs import pose_by_targets
 from stage.capture.camera import Camera
 from tests.scenes.statue import place
