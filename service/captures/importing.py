@@ -4,7 +4,6 @@ Uploaded files that are no capture get a proposal first: what they seem to be, a
 untrusted files: `service.captures.check_process` calls them in a process of its own.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.requests.base.base import Role
 from service.requests.base.import_choices import ImportChoices
-from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions, LightScale
+from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
 from service.requests.imports.layouts import LAYOUTS, options_of_layout, request_of, taken_apart, unsettled
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
 from service.requests.imports.patterns import (
@@ -30,8 +29,7 @@ from service.requests.imports.patterns import (
 )
 from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
-from stage.capture.light import DistantLight
-from stage.capture.manifest import Frame, read_manifest, write_manifest
+from stage.capture.manifest import read_manifest, write_manifest
 from stage.errors import ManifestError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
@@ -50,20 +48,9 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     imported = _IMPORTS[type(request)](request)
     manifest = read_manifest(imported.path)
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
-    changed: dict[str, Any] = {"assumed": (*manifest.assumed, *more)} if more else {}
-    if isinstance(request, LightScale) and request.scale is not None:
-        changed |= {"irradiance_scale": "absolute", "frames": tuple(_lit_by(each, math.pi * request.scale) for each in manifest.frames)}
-    if changed:
-        write_manifest(manifest.model_copy(update=changed), imported.path)
+    if more:
+        write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
     return imported
-
-
-def _lit_by(frame: Frame, factor: float) -> Frame:
-    """Return a frame whose far light is so many times as strong."""
-    if not isinstance(frame.light, DistantLight):
-        return frame
-    light = frame.light.model_copy(update={"irradiance": tuple(factor * value for value in frame.light.irradiance)})
-    return frame.model_copy(update={"light": light})
 
 
 def _diligent(request: DiligentImport) -> Imported:
@@ -75,7 +62,8 @@ def _diligent(request: DiligentImport) -> Imported:
 def _lp(request: LpImport) -> Imported:
     from stage.importers import lp
 
-    return Imported(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space), ())
+    return Imported(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space,
+                                     white=request.scale), ())
 
 
 def _opencv_gray(request: OpencvGrayImport) -> Imported:
@@ -91,7 +79,7 @@ def _olat(request: OlatImport) -> Imported:
     return olat.import_folder(
         request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
         variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
-        color_space=request.color_space)
+        color_space=request.color_space, white=request.scale)
 
 
 def _photos(request: PhotosImport) -> Imported:

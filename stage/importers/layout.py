@@ -2,12 +2,13 @@
 
 import io
 import json
+import math
 import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import OpenImageIO as oiio
@@ -26,6 +27,12 @@ T = TypeVar("T")
 
 PREVIOUS_NAME = "capture.previous.json"
 """The name under which a capture.json is kept that an import replaces by another."""
+
+
+def light_scale(white: float | None) -> tuple[Literal["relative", "absolute"], float]:
+    """Return the irradiance_scale of a capture, and the irradiance of a light of strength 1.
+    `white`: the reading of a white surface that faces such a light, which is its irradiance over π; None: nobody knows it."""
+    return ("relative", 1.0) if white is None else ("absolute", math.pi * white)
 
 
 class Imported(NamedTuple):

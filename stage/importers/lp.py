@@ -15,13 +15,15 @@ from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import View
-from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, read_lines, write_capture
+from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, light_scale, read_lines, write_capture
 from stage.model import name_fault
 
 
-def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None) -> Path:
+def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None,
+                  white: float | None = None) -> Path:
     """Write a capture.json for an RTI capture.
-    `source`: the .lp file, or a folder with exactly one .lp file. `color_space`: that of the images; None: by their depth."""
+    `source`: the .lp file, or a folder with exactly one .lp file. `color_space`: that of the images; None: by their depth. `white`:
+    the reading of a white surface that faces a light; None: unknown."""
     path = _find(source)
     folder = path.parent
     lines = read_lines(path)
@@ -30,7 +32,8 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     count, rows = int(lines[0][1]), lines[1:]
     if count != len(rows):
         raise ManifestError(f"{path}: says {count} images, holds {len(rows)}")
-    frames = [_frame(path, folder, number, row) for number, row in rows]
+    scale, irradiance = light_scale(white)
+    frames = [_frame(path, folder, number, row, irradiance) for number, row in rows]
     if not frames:
         raise ManifestError(f"{path}: names no image")
     first = folder / frames[0]["image"]
@@ -44,7 +47,7 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
         "assumed": assumed_encoding(space, color_space),
         "camera": (view or View()).entry(resolution),
         "mask": mask,
-        "irradiance_scale": "relative",
+        "irradiance_scale": scale,
         "frames": frames,
     }, path, destination)
 
@@ -59,7 +62,7 @@ def _find(source: Path) -> Path:
     return found[0]
 
 
-def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
+def _frame(path: Path, folder: Path, number: int, row: str, irradiance: float) -> dict[str, Any]:
     parts = row.rsplit(maxsplit=3)  # a name may hold spaces
     try:
         direction = [float(part) for part in parts[1:]]
@@ -75,4 +78,4 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
     name = parts[0].replace("\\", "/")
     with storage("read", folder / name):  # a name that is too long is an error of the file system
         relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else name.rsplit("/", 1)[-1]
-    return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}
+    return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [irradiance] * 3}}

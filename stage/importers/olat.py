@@ -16,7 +16,7 @@ from stage.capture.manifest import FILE_NAME, SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
-from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, natural_order, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, light_scale, natural_order, write_capture
 from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
 
@@ -26,7 +26,7 @@ LEAST = 3
 
 def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool, lights: Path | None = None, variable: str | None = None,
                   run: Run | None = None, strengths: Path | None = None, selection: Selection | None = None, view: View | None = None,
-                  color_space: ColorSpaceName | None = None) -> Imported:
+                  color_space: ColorSpaceName | None = None, white: float | None = None) -> Imported:
     """Write a capture.json for images under one far light each.
 
     Args:
@@ -34,6 +34,7 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
         to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
         variable, run: as `read_light_table` takes them.
         strengths: a file with the strength of each light; None: that in the table, else equal.
+        white: the reading of a white surface that faces a light of strength 1; None: unknown.
     """
     path = lights or find_table(source)
     table = read_light_table(path, variable=variable, run=run)
@@ -43,11 +44,12 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     if strength is not None and len(strength) != len(names):
         raise ManifestError(f"{strengths or path}: has {len(strength)} strengths, the table {len(names)} lights")
     directions = table.vectors @ camera_from_table(axes).T * (1 if to_light else -1)
-    irradiance = np.ones((len(names), 3)) if strength is None else strength
+    scale, unit = light_scale(white)
+    irradiance = unit * (np.ones((len(names), 3)) if strength is None else strength)
     behind = int((directions[:, 2] < 0).sum())
     lit = [{"type": "distant", "direction": list(direction), "irradiance": list(power)}
            for direction, power in zip(directions.tolist(), irradiance.tolist(), strict=True)]
-    return _written(source, destination, path, names, lit, chosen, view, None, color_space, (
+    return _written(source, destination, path, names, lit, chosen, view, None, color_space, scale=scale, facts=(
         ("lights", f"{len(names)} from {table.what}, {matched}"),
         ("axes", f"{describe(axes)}; vectors {'point to the light' if to_light else 'point along the rays, from the light'}"),
         ("side", f"{len(names) - behind} lights stand on the camera's side of the object, {behind} behind it"
@@ -69,7 +71,7 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
     positions = unit_m * rig.positions @ matrix.T
     far = np.linalg.norm(positions, axis=1)
     ahead = int((positions[:, 2] < 0).sum())
-    return _written(source, destination, path, names, _entries(rig, positions, matrix), chosen, view, camera, color_space, (
+    return _written(source, destination, path, names, _entries(rig, positions, matrix), chosen, view, camera, color_space, facts=(
         ("lights", f"{len(names)} near lights from {path}, {matched}"),
         ("axes", f"{describe(axes)}, from the centre of the camera"),
         ("places", f"{far.min():.3g} to {far.max():.3g} m from the camera, {ahead} of them in front of it: if they should not be, --axes "
@@ -99,13 +101,14 @@ def import_photos(source: Path, destination: Path, *, selection: Selection | Non
     if len(names) < LEAST:
         raise ManifestError(f"{source}: has {len(names)} images: normals need {LEAST} or more")
     lights = [PLACEHOLDER.model_dump(mode="json")] * len(names)
-    return _written(source, destination, source, names, lights, chosen, view, None, color_space, (
+    return _written(source, destination, source, names, lights, chosen, view, None, color_space, facts=(
         ("lights", f"{len(names)} placeholders, {names[0]} to {names[-1]}: relit solve --lights unknown finds them from the images; "
                    f"{MEASURED_BY}"),))
 
 
 def _written(source: Path, destination: Path, table: Path, names: Sequence[str], lights: list[dict[str, Any]], chosen: Selected,
-             view: View | None, camera: Path | None, color_space: ColorSpaceName | None, facts: tuple[tuple[str, str], ...]) -> Imported:
+             view: View | None, camera: Path | None, color_space: ColorSpaceName | None, *, facts: tuple[tuple[str, str], ...],
+             scale: str = "relative") -> Imported:
     """Write the capture of images under one light each, with the image of ambient light, and add what was understood of the images."""
     space = color_space or color_space_of(source / names[0])
     resolution = image_resolution(source / names[0])
@@ -114,7 +117,7 @@ def _written(source: Path, destination: Path, table: Path, names: Sequence[str],
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
         "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
-        "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
+        "irradiance_scale": scale, "assumed": assumed_encoding(space, color_space), "frames": frames,
     }, table, destination, folder=source)
     return Imported(written, (
         *facts, ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),

@@ -46,6 +46,8 @@ def test_the_scale_of_the_lights_gives_that_of_albedo(relit, tmp_path, layout):
     words = ["--axes", "right,up,towards", "--vectors", "to-light"] if layout == "olat" else []
     relit("import", layout, folder, *words, "--scale", reading).well()
     assert Capture.open(folder).manifest.irradiance_scale == "absolute"
+    relit("import", layout, folder, *words, "--scale", reading).well()
+    assert not (folder / "capture.previous.json").exists()  # nothing was replaced
     relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").well()
     albedo = SurfaceMaps.read(tmp_path / "maps" / "maps.exr").diffuse_albedo
     assert np.abs(albedo - scene.albedo)[scene.mask].max() < 2e-3  # half rounding of the stack and of the layers
