@@ -27,6 +27,8 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
         unit_m: the metres in one unit of T.
         color_space: that of the images; None: by their depth.
     """
+    if left.resolve() == right.resolve():
+        raise ManifestError(f"{right}: is named as the left and as the right camera: name the images of each")
     shown = [_images(side) for side in (left, right)]
     if len(shown[0]) != len(shown[1]):
         raise ManifestError(f"{right}: has {len(shown[1])} images and {left} {len(shown[0])}: each moment needs one of either camera")
@@ -37,11 +39,12 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
     first, second = (image_resolution(side[0]) for side in shown)
     rig = camera_and_projector(calibration, first, second, unit_m, second="second camera", extrinsics=extrinsics)
     pose = np.array(rig["projector"].pop("camera_from_projector"))
+    name = right.stem if right.is_file() else right.resolve().name
     space = color_space or color_space_of(shown[0][0])
     data: dict[str, Any] = {
         "schema": SCHEMA, "name": folder.name, "color_space": space, "assumed": assumed_encoding(space, color_space),
         "camera": rig["camera"],
-        "other_cameras": [{"name": right.stem or "right", **rig["projector"], "camera_from_other": pose.tolist()}],
+        "other_cameras": [{"name": name or "right", **rig["projector"], "camera_from_other": pose.tolist()}],
         "frames": [{"image": one, "stereo": {"images": [other]}} for one, other in zip(*names, strict=True)]}
     x, y, z = pose[:3, 3]
     return Imported(write_capture(data, calibration, destination or folder, folder=folder), (

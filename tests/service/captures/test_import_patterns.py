@@ -213,7 +213,7 @@ def pair():
 def test_two_cameras(relit, tmp_path, pair, kind):
     """Two folders and what cv2.stereoCalibrate found: true depth in two commands, whatever the images are called."""
     left, visible, recorded = pair
-    for folder, image in zip(("cam0", "cam1"), recorded, strict=True):
+    for folder, image in zip(("cam0", "cam.1"), recorded, strict=True):
         write_image(tmp_path / folder / f"{folder}_frame.png", image)
     rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, stereo.OTHER), pose=stereo.POSE)
     words = ["--calibration", rig]
@@ -229,9 +229,9 @@ def test_two_cameras(relit, tmp_path, pair, kind):
                     file.write(key, found[key])
                 file.release()
             words = ["--calibration", rig, "--extrinsics", tmp_path / "intrinsics.yml"]
-            relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam1", tmp_path / "pair", *words).refused("intrinsics.yml")
+            relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam.1", tmp_path / "pair", *words).refused("intrinsics.yml")
             words = ["--calibration", tmp_path / "intrinsics.yml", "--extrinsics", tmp_path / "extrinsics.yml"]
-    out = relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam1", tmp_path / "pair", *words, "--unit-m", "0.001").well()
+    out = relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam.1", tmp_path / "pair", *words, "--unit-m", "0.001").well()
     assert f"{np.linalg.norm(stereo.POSE[:3, 3]):.4g} m from the first camera" in out
     manifest = Capture.open(tmp_path / "pair").manifest
     other, truth = manifest.other_cameras[0], stereo.OTHER
@@ -239,6 +239,7 @@ def test_two_cameras(relit, tmp_path, pair, kind):
     np.testing.assert_allclose((*other.focal_px, *other.principal_px), (truth.focal, truth.focal, *truth.principal), atol=1e-9)
     if kind != "one file":  # alike from here on
         return
+    assert other.name == "cam.1"
     relit("depth", tmp_path / "pair", "--out", tmp_path / "out").well()
     maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
     off = np.abs(maps.depth - left.depth)[maps.mask & visible]  # a pixel of disparity is 19 to 27 mm at 1 to 1.2 m
@@ -247,7 +248,7 @@ def test_two_cameras(relit, tmp_path, pair, kind):
 
 @pytest.mark.parametrize(("left", "right", "message"), [
     (("a/0.png", "a/1.png"), ("b/0.png",), "has 1 images and"), (("c/a/0.png",), ("b/0.png",), "does not lie beside"),
-    (("a/0.png",), ("b/0.txt",), "holds no images")])
+    (("a/0.png",), ("b/0.txt",), "holds no images"), (("a/0.png",), ("a/1.png",), "is named as the left and as the right camera")])
 def test_pairs_that_are_none(relit, tmp_path, left, right, message):
     for name in (*left, *right):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
