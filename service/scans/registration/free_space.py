@@ -41,6 +41,11 @@ HIDES, MOST_HIDDEN = 6.0, 0.1
 place, and says nothing."""
 
 
+LEAST_SPREAD = 1e-3
+"""Spread in radians of the lines of sight of a set, below which they are parallel and meet nowhere: of a scanner, a set of a hundredth of
+its distance in size has three times that."""
+
+
 class Sight(NamedTuple):
     """Numbers of points of one scan that another scan sees, or contradicts."""
 
@@ -144,7 +149,9 @@ def _seen_by_set(cloud: Cloud, points: np.ndarray, pose: np.ndarray, tolerance: 
     own = cloud.points[cloud.sample]
     spacing = float(np.median(cloud.spacing)) * float(np.sqrt(len(cloud.points) / len(own)))
     across = np.eye(3) - cloud.directions[cloud.sample][:, :, None] * cloud.directions[cloud.sample][:, None, :]
-    together = across.sum(axis=0) + 1e-12 * len(own) * np.eye(3)  # parallel lines meet nowhere
+    together = across.sum(axis=0)
+    if np.linalg.eigvalsh(together)[0] < LEAST_SPREAD**2 * len(own):
+        return Sight(0, 0, 0)
     origin = np.linalg.solve(together, (across @ own[:, :, None]).sum(axis=0)[:, 0])
     length = np.linalg.norm(own - origin, axis=1)
     if not length.min() > 0:

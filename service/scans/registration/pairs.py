@@ -45,7 +45,8 @@ the spacing of the points and with the bend of the surface, as the error of the 
 spacings of 6 to 20 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
 details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
 FEW_MATCHES, FEW_DETERMINED, FEW_BENT = 200, 10.0, 0.3
-"""The same of fewer matches than this: those of a stem, joined to its turned self, come back too."""
+"""`NOT_DETERMINED` and `BENT` of a pair with fewer matches than the first number: so few of a stem, joined to its turned self, come
+back when they are tried out, as right ones do, and more must speak for each direction."""
 TRIED_POINTS = 800
 """The most points of the fit that is first tried out."""
 SHIFTS = (0.05, -0.05, 0.1, -0.1, 0.3, -0.3, 0.6, -0.6)
