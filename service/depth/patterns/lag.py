@@ -25,13 +25,14 @@ from stage.stack.planes import Planes
 AROUND = 15
 """Side in pixels of the square over which a lag is averaged."""
 LEAST_KNOWN = 0.2
-"""Least part of the square that must be decoded."""
+"""Least part of the square that must be decoded: 45 pixels, over which what is not a lag averages to a seventh."""
 STRIPS = 6
 """Number of strips of image rows, as high as the square, that are looked at first."""
 CLEAR_SIGMAS, CLEAR_PX = 4.0, 0.1
 """Lag in its standard deviations and in projector pixels from which on it is neither noise nor a lens."""
 PROBABLE_SIGMAS = 3.0
-"""The same for places whose surroundings, as far as the square reaches, are taken for translucent where others are for certain."""
+"""The same in σ for single places where others are clear: from there on the surroundings of a place, as far as the square reaches, are
+taken for translucent. Noise alone goes beyond it at one place in 370, which makes σ wider there and nothing wrong."""
 CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""

@@ -69,6 +69,16 @@ class PatternCodes(NamedTuple):
         return any(decoder is not None and decoder.colour for decoder in (self.columns, self.rows))
 
 
+class Checks(NamedTuple):
+    """What a sample of the frames says about all of them."""
+
+    warnings: list[str]
+    codes: PatternCodes
+    """The decoders, by the exponent of the projector where the sample tells one."""
+    declared: bool
+    """False where the patterns are declared otherwise than they were shown: no other check allows for such errors."""
+
+
 def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str,
                    timings: Timings) -> DepthSolution | DecodedSolution:
     """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
@@ -90,8 +100,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
-        warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
-        declared = not any(sentence.startswith("frames:") for sentence in warnings)
+        warnings, codes, declared = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
             timings.stage("decode", mask.shape[0])
@@ -164,8 +173,8 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
 
 def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
              capture: Capture, frames: list[Frame], noise: NoiseModel, device: str,
-             request: DepthRequest) -> tuple[list[str], PatternCodes]:
-    """Return what a sample of the frames says about all of them, and the decoders that heed it."""
+             request: DepthRequest) -> Checks:
+    """Judge the declaration by a sample of the frames."""
     sample = sample_of(planes, capture.camera, mask)
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
@@ -174,15 +183,15 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
     wrong = wrong or waves.wrong
     if wrong is not None:
-        return [wrong], codes
+        return Checks([wrong], codes, False)
     said = [] if waves.unconfirmed is None else [waves.unconfirmed]
     if shown.response is None:
         bent = bent_back(sample, codes.collected, shown, noise) or shown._replace(
             exponent=find_exponent(sample, codes.collected, shown, noise, device))
         if bent.exponent != 1.0:
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-            return [*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine)
-    return said, codes
+            return Checks([*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine), True)
+    return Checks(said, codes, True)
 
 
 def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel) -> np.ndarray:
