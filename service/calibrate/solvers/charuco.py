@@ -23,6 +23,9 @@ DICTIONARIES = {
 """The sets of markers; a smaller ArUco set of the same grid is the beginning of that with 1000."""
 LEAST_MARKERS = 4
 """The fewest markers whose centres place a board."""
+SMALL_PX = 30.0
+"""Side of markers in pixels, below which they are looked for in the image at twice its size too: OpenCV reads 4 to 8 of 35 markers of 12
+pixels, and 23 to 31 of them so."""
 LEAST_SEEN = 8
 """The fewest corners of a view: their positions on the board then hold its pose twice over."""
 PLACE_OF_SQUARE = 0.25
@@ -97,10 +100,15 @@ def _markers(shown: np.ndarray, dictionary: str) -> tuple[np.ndarray, np.ndarray
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
-    found, numbers, _ = detector.detectMarkers(shown)
-    if numbers is None:
-        return np.zeros((0, 4, 2)), np.zeros(0, int)
-    return np.array(found, np.float64).reshape(-1, 4, 2), np.ravel(numbers)
+    best = np.zeros((0, 4, 2)), np.zeros(0, int)
+    for times in (1, 2):
+        enlarged = shown if times == 1 else cv2.resize(shown, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+        found, numbers, _ = detector.detectMarkers(enlarged)
+        if numbers is not None and len(numbers) > len(best[1]):
+            best = (np.array(found, np.float64).reshape(-1, 4, 2) - (times - 1) / 2) / times, np.ravel(numbers)
+        if len(best[1]) >= LEAST_MARKERS and np.median(np.linalg.norm(best[0][:, 0] - best[0][:, 1], axis=1)) > SMALL_PX:
+            break
+    return best
 
 
 def _layout(board: tuple[int, int], charuco: Charuco, legacy: bool) -> cv2.aruco.CharucoBoard:

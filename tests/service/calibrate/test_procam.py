@@ -16,6 +16,7 @@ from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_image, write_manifest
 from tests.scenes.depth import BLACK_WHITE, entry_of
+from tests.service.calibrate.solvers import test_charuco as charuco
 from tests.service.calibrate.solvers import test_procam as boards
 
 CAMERA = boards.CAMERA
@@ -34,9 +35,9 @@ def phase(axis, period):
 PATTERNS = [*phase("column", 24), *phase("column", 25), *phase("row", 24), *phase("row", 25), *BLACK_WHITE]
 
 
-def write_view(folder, pose, **manifest):
+def write_view(folder, pose, radiance=None, **manifest):
     """One pose of the board under phases of both axes: with Gray codes it would be 34 images."""
-    radiance = boards.board_image(pose)
+    radiance = boards.board_image(pose) if radiance is None else radiance
     rays = reference.pixel_rays(CAMERA)
     normal = pose[:3, 2]
     points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
@@ -81,6 +82,28 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     assert maps.mask[corners].mean() > 0.9
     off = np.abs(maps.depth + points[..., 2])[corners][maps.mask[corners]]
     assert np.median(off) < 0.01  # of 0.9 m: five views of corners that are good to 0.1 px
+
+
+@pytest.mark.long
+def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
+    """Each pose has another strip of the board cut off by the image or hidden."""
+    sheet = charuco.print_of("aruco4", boards.BOARD, side=0.75)
+    folders = []
+    for number, pose in enumerate(boards.poses(6)):
+        radiance = charuco.drawn((pose[:3, :3], pose[:3, 3]), CAMERA, sheet, boards.BOARD, boards.SQUARE)
+        radiance[:, :130] = 0.1 if number % 2 else radiance[:, :130]
+        write_view(tmp_path / f"pose{number}", pose, radiance)
+        folders.append(tmp_path / f"pose{number}")
+    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192", "--markers", "aruco4", "--marker-m"
+    assert "of a square wide" in relit.refused("calibrate", "procam", *folders, *words, 0.015)
+    relit.done("calibrate", "procam", *folders, *words, 0.0225)
+    manifest = Capture.open(folders[0]).manifest
+    views = json.loads((folders[0] / "calibration.json").read_text())["procam"]["views"]
+    assert len(views) == 6 and min(view["corners"] for view in views) < 54
+    # squares of 17 pixels with markers 2 pixels from each corner: corners are good to 0.25 px, and two thirds of a chessboard's are seen
+    assert np.abs(np.array(manifest.camera.focal_px) / CAMERA.focal - 1).max() < 0.025
+    assert np.abs(np.array(manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.025
+    assert np.linalg.norm(np.array(manifest.projector.camera_from_projector)[:3, 3] - boards.POSE[:3, 3]) < 0.005
 
 
 def test_what_is_wrong_is_said(relit, rig, tmp_path):

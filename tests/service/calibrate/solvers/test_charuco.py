@@ -51,17 +51,21 @@ def print_of(dictionary, board=BOARD, side=SIDE, size=200):
 SHEET = print_of("aruco5")
 
 
-def seen(pose, device=CAMERA, fine=3):
-    """Linear image of the board; what lies around it is grey."""
+def drawn(pose, device, sheet, board, square, fine=3):
+    """Linear image of a printed board; what lies around it is grey."""
     turn, place = pose
     rays = fine_rays(device, fine)
     own = (rays * (place @ turn[:, 2] / (rays @ turn[:, 2]))[..., None] - place) @ turn
-    size = SHEET.shape[1] / (BOARD[0] + 1)
-    col, row = ((sign * own[..., axis] / SQUARE + (BOARD[axis] + 1) / 2) * size for axis, sign in ((0, 1), (1, -1)))
-    inside = (col >= 0) & (col < SHEET.shape[1]) & (row >= 0) & (row < SHEET.shape[0])
-    shade = SHEET[np.clip(row, 0, SHEET.shape[0] - 1).astype(int), np.clip(col, 0, SHEET.shape[1] - 1).astype(int)]
+    size = sheet.shape[1] / (board[0] + 1)
+    col, row = ((sign * own[..., axis] / square + (board[axis] + 1) / 2) * size for axis, sign in ((0, 1), (1, -1)))
+    inside = (col >= 0) & (col < sheet.shape[1]) & (row >= 0) & (row < sheet.shape[0])
+    shade = sheet[np.clip(row, 0, sheet.shape[0] - 1).astype(int), np.clip(col, 0, sheet.shape[1] - 1).astype(int)]
     radiance = np.where(inside, 0.06 + 0.7 * shade, 0.5)
     return radiance.reshape(device.height, fine, device.width, fine).mean(axis=(1, 3)).astype(np.float32)
+
+
+def seen(pose, device=CAMERA):
+    return drawn(pose, device, SHEET, BOARD, SQUARE)
 
 
 def truth(pose, device=CAMERA):
