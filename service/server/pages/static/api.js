@@ -106,10 +106,14 @@ export function newToken() {
   return crypto.getRandomValues(new Uint32Array(4)).join("-");
 }
 
-/** Submit a job, once however often its request has to be sent, and return it. */
+/** Create something once, however often its request has to be sent, and return it. */
+export function postOnce(path, body, token = newToken()) {
+  return repeated(() => post(path, body, { "Idempotency-Key": token }), mayPass);
+}
+
+/** Submit a job and return it. */
 export function submitJob(request) {
-  const headers = { "Idempotency-Key": newToken() };
-  return repeated(() => post("/v1/jobs", request, headers), mayPass);
+  return postOnce("/v1/jobs", request);
 }
 
 /** Delete what is at a path. */

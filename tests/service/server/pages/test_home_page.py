@@ -112,6 +112,36 @@ def test_nothing_yet_says_what_to_do(page):
     page.get_by_text(f"Project {EVIL}").wait_for()
 
 
+def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card(page):
+    """Each card comes as it is made; the project's name, which never comes, holds nothing up."""
+    tokens, held = [], []
+    pretend(page, [])
+    page.route("**/v1/project", lambda route: None)
+
+    def make(route):
+        tokens.append(route.request.headers["idempotency-key"])
+        if "environments" in route.request.url:
+            held.append(route)
+        else:
+            route.fulfill(status=201, json=capture(1) | {"name": "owl"})
+
+    page.route("**/v1/samples/**", make)
+    page.goto("/")
+    page.get_by_role("button", name="Open the sample owl").click()
+    page.locator(".card a", has_text="owl").wait_for()
+    assert page.locator("#sample").is_disabled()
+    until(lambda: page.wait_for_timeout(10) or held, "the environment is not asked for")
+    held[0].fulfill(status=201, json=capture(2) | {"id": f"env_{2:020d}", "name": "sky", "facts": {}})
+    page.locator(".card", has_text="sky").wait_for()
+    page.wait_for_function("() => document.activeElement.closest('.card') !== null && !document.getElementById('sample').disabled")
+    assert len(set(tokens)) == len(tokens) == 2
+    page.get_by_role("button", name="Close", exact=True).click()
+    assert not page.locator("#drop").is_visible() and page.evaluate("document.activeElement.id") == "add"
+    with page.expect_file_chooser():
+        page.get_by_role("button", name="Add a folder").click()
+    assert page.locator("#drop").is_visible()
+
+
 @pytest.mark.long
 def test_the_sample_is_opened_by_one_click_where_nothing_is_yet(browser, tmp_path):
     """A key of scope write suffices; the folder of the sample is none that this operator allows for others."""

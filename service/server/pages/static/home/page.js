@@ -1,6 +1,6 @@
 /** The home page: all captures, sequences, assets and environments as cards, and the jobs above them. */
 
-import { attempt, load, newToken, post, read, Refusal, send } from "../api.js";
+import { attempt, load, newToken, postOnce, read, Refusal, send } from "../api.js";
 import { mountDropZone } from "../upload/drop_zone.js";
 import { byId, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
@@ -19,7 +19,7 @@ let most = PAGE;
 let isLoaded = false;
 let mayPrepare = true;
 const wanted = { words: byId("search"), order: byId("order"), get kind() { return byId("bar").elements.namedItem("kind"); } };
-const sampleToken = newToken(); // two clicks register one sample
+let sampleToken = newToken(); // a request that is sent again registers one sample
 const jobs = new Jobs(changed);
 const nameOf = (id) => items.get(id)?.name;
 
@@ -35,10 +35,13 @@ const sight = new IntersectionObserver((entries) => {
 function draw() {
   const asks = { words: wanted.words.value, kind: wanted.kind.value, order: wanted.order.value };
   const found = chosen(items.values(), asks);
+  const focused = document.activeElement;
   byId("wall").replaceChildren(...found.slice(0, most).map((item) => cards.get(item.id) ?? makeCard(item)));
+  if (byId("wall").contains(focused)) focused.focus({ preventScroll: true }); // what is moved loses it
   byId("count").textContent = !isLoaded || items.size === 0 ? "" : found.length === items.size ? `${found.length} in all` : `${found.length} of ${items.size}`;
   show(byId("more"), found.length > most);
   show(byId("empty"), isLoaded && items.size === 0);
+  show(byId("close"), items.size > 0); // where nothing is here yet, the panel stays
   if (isLoaded && items.size === 0) openDropZone();
   const address = new URLSearchParams(Object.entries(asks).filter(([name, value]) => value !== (name === "order" ? "newest" : "")));
   history.replaceState(null, "", address.size === 0 ? location.pathname : `?${address}`);
@@ -53,7 +56,6 @@ function makeCard(item) {
 
 function openDropZone() {
   show(byId("adding"), true);
-  byId("add").setAttribute("aria-expanded", "true");
 }
 
 /** Take an item as it is now. */
@@ -62,7 +64,10 @@ function put(item) {
   const before = cards.get(item.id);
   if (before === undefined) return;
   sight.unobserve(before);
-  before.replaceWith(makeCard(item));
+  const isFocused = before.contains(document.activeElement);
+  const card = makeCard(item);
+  before.replaceWith(card);
+  if (isFocused) card.querySelector("a")?.focus({ preventScroll: true });
 }
 
 async function showPicture(card) {
@@ -127,9 +132,20 @@ async function refresh(id) {
   }
 }
 
+/** Register the sample and its environment, show each as it is there, and go on at the first card. */
 async function openSample() {
-  for (const list of ["captures", "environments"]) put(intakeItem(list, await post(`/v1/samples/${list}`, undefined, { "Idempotency-Key": `${sampleToken}-${list}` })));
-  draw();
+  const button = byId("sample");
+  button.disabled = true;
+  try {
+    for (const list of ["captures", "environments"]) {
+      put(intakeItem(list, await postOnce(`/v1/samples/${list}`, undefined, `${sampleToken}-${list}`)));
+      draw();
+    }
+    sampleToken = newToken(); // who has deleted it can open it again
+  } finally {
+    button.disabled = false;
+    if (document.activeElement === document.body) (byId("wall").querySelector("a") ?? button).focus();
+  }
 }
 
 async function showProject() {
@@ -151,18 +167,20 @@ byId("bar").addEventListener("submit", (event) => event.preventDefault());
 byId("more").addEventListener("click", () => { most += PAGE; draw(); });
 new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !byId("more").hidden) byId("more").click(); }, { rootMargin: "600px" }).observe(byId("more"));
 byId("add").addEventListener("click", () => {
-  openDropZone(); // it is open where nothing is here yet
+  openDropZone();
   byId("folder").click(); // what most people want; the panel stays for the rest
 });
+byId("close").addEventListener("click", () => { show(byId("adding"), false); byId("add").focus(); });
 addEventListener("dragenter", () => { openDropZone(); document.body.classList.add("dragging"); });
 for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
 addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));
 byId("sample").addEventListener("click", () => attempt(openSample));
 mountDropZone(fill);
 
+attempt(showProject); // the cards do not wait for it
 await load(async () => {
   await fill("captures");
-  await Promise.all([...LISTS.slice(1).map(fill), jobs.load(), showProject()]);
+  await Promise.all([...LISTS.slice(1).map(fill), jobs.load()]);
   isLoaded = true;
   draw();
   prepareNext();

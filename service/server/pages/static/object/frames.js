@@ -1,6 +1,6 @@
 /** Relit frames of an object: a player over small pictures that the server makes of them, a filmstrip, a video, and the files. */
 
-import { attempt, fetched, listing } from "../api.js";
+import { attempt, fetched, listing, Refusal } from "../api.js";
 import { bytes, element } from "../element.js";
 import { savingLink } from "./files.js";
 import { offerVideo } from "./video.js";
@@ -8,6 +8,7 @@ import { offerVideo } from "./video.js";
 const FRAME = /^(.*\/)?frame\.\d+\.exr$/;
 const PICTURES_PER_S = 24;
 const PARALLEL = 3;
+const UNREADABLE = "The browser cannot read it.";
 const STRIP_PX = 72; // height of the pictures of the filmstrip
 
 /**
@@ -36,16 +37,22 @@ async function player(place, job, isChosen) {
   const files = element("details", {}, element("summary", {}, `${frames.length === 1 ? "The frame" : `All ${frames.length} frames`} as EXR`),
     element("ul", { class: "plain" }, ...frames.map((result) => element("li", {}, savingLink({ name: result.name, result }), ` ${bytes(result.size)}`))));
   const pictures = []; // as the server sends them: decoded, all of them would take thirty times the memory
-  let [at, playing, isDecoding] = [0, null, false];
+  const faults = new Map(); // why frames have no picture, by their place
+  let [at, playing, isDrawing, drawing] = [0, null, false, null];
 
-  /** Show a frame; while one is decoded, only the last that was asked for waits. */
-  async function show(index) {
+  /** Show a frame; while one is decoded, only the last that was asked for waits. Ends when it is drawn. */
+  function show(index) {
     strip.children[at].firstChild.setAttribute("aria-pressed", "false");
     strip.children[index].firstChild.setAttribute("aria-pressed", "true");
     at = index;
     slider.value = String(index);
-    if (isDecoding) return;
-    isDecoding = true;
+    say();
+    if (!isDrawing) drawing = drawLast();
+    return drawing;
+  }
+
+  async function drawLast() {
+    isDrawing = true;
     let drawn = null;
     try {
       while (drawn !== at && pictures[at] !== undefined) {
@@ -54,10 +61,22 @@ async function player(place, job, isChosen) {
         draw(picture);
         picture.close();
       }
+    } catch {
+      pictures[drawn] = undefined;
+      faults.set(drawn, UNREADABLE);
+      say();
     } finally {
-      isDecoding = false;
+      isDrawing = false;
     }
-    told.textContent = `${frames[at].name} (${at + 1} of ${frames.length})${drawn === at ? "" : ", its picture is being made"}`;
+  }
+
+  /** Say which frame is shown, and why it has no picture, with a button that asks for those that did not come. */
+  function say() {
+    const fault = faults.get(at);
+    const why = fault !== undefined ? ` has no picture. ${fault}` : pictures[at] === undefined ? ", its picture is being made" : "";
+    told.textContent = `${frames[at].name} (${at + 1} of ${frames.length})${why}`;
+    again.hidden = faults.size === 0;
+    again.textContent = faults.size === 1 ? "Try the missing picture again" : `Try ${faults.size} missing pictures again`;
   }
 
   function draw(picture) {
@@ -68,41 +87,65 @@ async function player(place, job, isChosen) {
   function stopPlaying() {
     clearInterval(playing);
     playing = null;
+    told.removeAttribute("aria-live");
     play.setAttribute("aria-pressed", "false");
   }
 
+  const again = element("button", { type: "button", class: "quiet", hidden: true, onclick: () => {
+    waiting.push(...faults.keys());
+    faults.clear();
+    say();
+    play.focus(); // the button goes
+    loadAll();
+  } });
   const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false", onclick: () => {
     if (playing !== null) return stopPlaying();
     play.setAttribute("aria-pressed", "true");
+    told.setAttribute("aria-live", "off"); // nobody can listen to 24 names a second
     playing = setInterval(() => (canvas.isConnected ? show((at + 1) % frames.length) : stopPlaying()), 1000 / PICTURES_PER_S);
     return undefined;
   } }, "Play");
   slider.addEventListener("input", () => show(Number(slider.value)));
 
+  /** Fetch the picture of a frame; where it does not come, the frame says why. */
   async function fill(index) {
-    const small = element("canvas", { height: STRIP_PX });
-    const button = strip.children[index].firstChild;
     const path = `/v1/jobs/${job}/pictures/${frames[index].name.split("/").map(encodeURIComponent).join("/")}`;
-    pictures[index] = await fetched(path, (answer) => answer.blob());
-    const picture = await createImageBitmap(pictures[index]);
+    try {
+      const taken = await fetched(path, (answer) => answer.blob());
+      drawSmall(index, await createImageBitmap(taken));
+      pictures[index] = taken;
+    } catch (error) {
+      faults.set(index, error instanceof Refusal ? error.message : UNREADABLE);
+    }
+    if (index === at) await show(index);
+    else say();
+  }
+
+  function drawSmall(index, picture) {
+    const small = element("canvas", { height: STRIP_PX });
     small.width = Math.max(1, Math.round((STRIP_PX * picture.width) / picture.height));
     const pen = small.getContext("2d");
     pen.imageSmoothingQuality = "high";
     pen.drawImage(picture, 0, 0, small.width, small.height);
-    button.replaceChildren(small);
-    if (index === at) await show(index);
     picture.close();
+    strip.children[index].firstChild.replaceChildren(small);
   }
 
   strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",
     onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
-  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told)), tools, strip, files);
+  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told), element("p", { class: "actions" }, again)), tools, strip, files);
   const waiting = frames.map((_, index) => index);
   const load = async () => { for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next); };
+  const loadAll = () => attempt(async () => {
+    await Promise.all(Array.from({ length: PARALLEL }, load));
+    if (!canvas.isConnected || canvas.dataset.ready !== undefined || frames.some((_, index) => pictures[index] === undefined)) return;
+    if (frames.length > 1) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => {
+      stopPlaying();
+      return show(Math.min(frames.length - 1, Math.floor(share * frames.length)));
+    });
+    canvas.dataset.ready = "";
+  });
   show(0);
   await fill(waiting.shift());
-  attempt(() => Promise.all(Array.from({ length: PARALLEL }, load)).then(() => {
-    if (frames.length > 1 && canvas.isConnected) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => show(Math.min(frames.length - 1, Math.floor(share * frames.length))));
-    canvas.dataset.ready = "";
-  }));
+  loadAll();
 }

@@ -6,6 +6,7 @@ import { element } from "../element.js";
 const FORMATS = ["video/webm;codecs=vp9", "video/webm", "video/mp4"];
 const SECONDS = 6;
 const PICTURES_PER_S = 30;
+const LAST_MS = 2000 / PICTURES_PER_S; // a recorder that stops at once leaves out what was drawn last
 const BITS_PER_S = 8_000_000;
 
 /**
@@ -28,7 +29,7 @@ export function mountVideo(tools, name, viewer) {
  * @param {string} name Of the file, without its suffix.
  * @param {HTMLCanvasElement} canvas
  * @param {number} seconds How long it is.
- * @param {function(number): void} show Shows the picture at a share of the video, 0 to 1.
+ * @param {function(number): Promise<void>|void} show Shows the picture at a share of the video, 0 to 1; where it takes time, the video waits.
  */
 export function offerVideo(tools, name, canvas, seconds, show) {
   const format = FORMATS.find((each) => globalThis.MediaRecorder?.isTypeSupported(each));
@@ -36,7 +37,7 @@ export function offerVideo(tools, name, canvas, seconds, show) {
   const button = element("button", { type: "button", class: "quiet", onclick: () => attempt(async () => {
     button.disabled = true;
     try {
-      const told = (share) => { show(share); button.textContent = `Recording ${Math.round(100 * share)} %`; };
+      const told = async (share) => { await show(share); button.textContent = `Recording ${Math.round(100 * share)} %`; };
       save(await recorded(canvas, format, seconds, told), `${name}.${format.slice(6).split(";")[0]}`);
     } finally {
       button.disabled = false;
@@ -56,13 +57,14 @@ function recorded(canvas, format, seconds, show) {
     recorder.addEventListener("error", () => { reject(new Error("the browser cannot record what it shows")); });
     recorder.start();
     const began = performance.now();
-    const step = (now) => {
+    const step = async (now) => {
       const share = Math.min(1, Math.max(0, now - began) / (1000 * seconds));
-      show(share);
-      if (share < 1) requestAnimationFrame(step);
-      else recorder.stop();
+      await show(share);
+      if (share < 1) requestAnimationFrame(again);
+      else setTimeout(() => recorder.stop(), LAST_MS);
     };
-    requestAnimationFrame(step);
+    const again = (now) => step(now).catch(reject);
+    requestAnimationFrame(again);
   });
 }
 

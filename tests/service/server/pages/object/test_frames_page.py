@@ -1,7 +1,9 @@
 """Relit frames on the page of their object: pictures that the server makes, a player, a video, and the files."""
 
 import io
+from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -33,6 +35,17 @@ def relit(server, solved, sky) -> str:
                                      "name": "<img src=x onerror=alert(1)>", "options": {"frames": f"1-{FRAMES}", "spin_degrees": 90}})
 
 
+def last_frame_of(video: Path, server, job: str) -> int:
+    """The number of the frame that is most like the last picture of a video."""
+    recording, last = cv2.VideoCapture(str(video)), None
+    while (read := recording.read())[0]:
+        last = read[1].astype(np.float32)
+    with server.client() as client:
+        names = [f"/v1/jobs/{job}/pictures/frame.{number:04}.exr" for number in range(1, FRAMES + 1)]
+        frames = [cv2.imdecode(np.frombuffer(client.get(name).content, np.uint8), cv2.IMREAD_COLOR) for name in names]
+    return 1 + int(np.argmin([np.abs(last - frame).mean() for frame in frames]))
+
+
 def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved, relit, tmp_path):
     with server.client() as client:
         answer = client.get(f"/v1/jobs/{relit}/pictures/frame.0001.exr").raise_for_status()
@@ -48,7 +61,34 @@ def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved
     assert np.abs(shown - expected).mean() < 0.02  # JPEG, whose colour has half of the resolution
 
 
-def test_frames_are_played_recorded_and_saved(page, solved, relit):
+def test_a_picture_that_does_not_come_is_said_in_words_and_asked_for_again(page, solved, relit):
+    lost = [True]
+
+    def answer(route):
+        if lost[0]:
+            route.fulfill(status=404, json={"title": "gone", "detail": "<img src=x onerror=alert(1)> is gone"})
+        else:
+            route.continue_()
+
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    page.route("**/pictures/frame.0001.exr", answer)
+    page.route("**/pictures/frame.0003.exr", lambda route: route.fulfill(body=b"no picture") if lost[0] else route.continue_())
+    page.goto(f"{solved.pages['object']}#mode=frames")
+    page.get_by_text(f"frame.0001.exr (1 of {FRAMES}) has no picture. <img").wait_for()
+    again = page.get_by_role("button", name="Try 2 missing pictures again")
+    again.wait_for()
+    page.get_by_role("button", name="Frame 3").click()
+    page.get_by_text(f"(3 of {FRAMES}) has no picture. The browser cannot").wait_for()
+    assert page.get_by_role("button", name="Save a video").count() == 0  # a video with gaps would be no video of the frames
+    lost[0] = False
+    again.click()
+    page.locator("[data-shows=frames] canvas[data-ready]").wait_for()
+    page.get_by_text(f"frame.0003.exr (3 of {FRAMES})", exact=True).wait_for()
+    assert not again.is_visible()
+    page.get_by_role("button", name="Save a video").wait_for()
+
+
+def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     page.add_init_script(COUNT_BITMAPS)
     page.goto(f"{solved.pages['object']}#mode=frames")
@@ -68,6 +108,7 @@ def test_frames_are_played_recorded_and_saved(page, solved, relit):
     with page.expect_download() as download:
         page.get_by_role("button", name="Save a video").click()
     assert download.value.path().read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
+    assert last_frame_of(download.value.path(), server, relit) == FRAMES
     page.wait_for_function("() => openBitmaps === 0")
     assert 0 < page.evaluate("() => mostOpen") <= MOST_OPEN
     page.get_by_text(f"All {FRAMES} frames as EXR").click()
