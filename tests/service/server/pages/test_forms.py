@@ -36,11 +36,13 @@ TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x
          "calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
          "patterns": {"code": "gray", "projector": "64x32"}}
 
-LISTS = {"corners": [1.5, 1, 9, 1, 9, 5, 1, 5], "grid": [6, 4]}
-"""Values of lists of another length than most."""
+VALUES: dict[str, object] = {"corners": [1.5, 1, 9, 1, 9, 5, 1, 5], "grid": [6, 4], "marker_m": 0.018}
+"""Values where the usual one does not do: lists of another length than most, and a marker within its square."""
 INSTEAD = {("calibrate-laser-planes", "step_m"): ("board", "square_m")}
 """What an option stands in place of."""
-WITH = {("inspect-board", "stiffness_m"): {"remove": "spline"}}
+WITH: dict[tuple[str, str], dict[str, object]] = {("inspect-board", "stiffness_m"): {"remove": "spline"}} | {
+    (kind, name): beside for kind in ("calibrate-procam", "calibrate-stereo", "calibrate-laser-planes")
+    for name, beside in (("markers", {"marker_m": 0.018}), ("marker_m", {"markers": "aruco4"}))}
 """What an option needs beside it."""
 
 
@@ -75,7 +77,7 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
     typed = TYPED.get(kind, inputs)
     for field in fields(form_of(kind, model)).values():
         value = {"boolean": field.default != "true", "integer": int(allowed(field)), "number": allowed(field), "integers": [1, 2, 3, 4],
-                 "numbers": [0.25, 0.5, 1], **LISTS}.get(field.name if field.name in LISTS else field.value_type)
+                 "numbers": [0.25, 0.5, 1], **VALUES}.get(field.name if field.name in VALUES else field.value_type)
         if value is None and field.choices:
             value = next(each for each, _ in field.choices if each != field.default)
         if value is None:
