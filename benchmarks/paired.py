@@ -60,7 +60,7 @@ def used() -> float:
 
 
 def _seconds(tree: Path) -> list[float]:
-    """Return what each work takes in a process of its own, by the modules of a checkout, with one thread of BLAS as commands have."""
+    """Return what each work takes in a process of the version, by the modules of a checkout, with one thread of BLAS as commands have."""
     return [float(line) for line in subprocess.run(
         [sys.executable, "-P", __file__], check=True, capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}).stdout.split()]

@@ -10,7 +10,7 @@ from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.calibrate.solvers.charuco import charuco_of, find_board
+from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, Lens, ProCam, calibrate, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.patterns import decoded_bands, full_scale, read_codes, scene_colour
@@ -121,6 +121,8 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
     seen = int(np.isfinite(corners).all(axis=-1).sum())
     if len(kept) < LEAST_CORNERS * seen:
         return f"only {len(kept)} of {seen} corners are decoded around"
+    if not holds_a_pose(kept, request.board):
+        return f"{len(kept)} corners are decoded around, too few in two rows and columns to hold a pose"
     return BoardView(str(capture.folder), corners[kept], lit[kept], kept)
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.calibrate.solvers.charuco import LEAST_SEEN, charuco_of, find_board
+from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import LEAST_VIEWS, LENS_FLAGS, Lens, board_points, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
@@ -181,7 +181,7 @@ def _shared(frame: BoardFrame, number: int, request: StereoRequest) -> SharedVie
         return None
     if request.markers is None:
         theirs = alike_order(first, theirs)
-    return SharedView(frame.name, first, theirs) if _seen_by_both(first, theirs).sum() >= LEAST_SEEN else None
+    return SharedView(frame.name, first, theirs) if holds_a_pose(np.flatnonzero(_seen_by_both(first, theirs)), request.board) else None
 
 
 def _corners(capture: Capture, name: str, request: StereoRequest) -> np.ndarray | str:

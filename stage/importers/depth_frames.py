@@ -160,7 +160,7 @@ def _timed(path: Path, columns: int) -> tuple[np.ndarray, list[list[str]]]:
     for number, line in read_lines(path):
         if line.startswith("#"):
             continue
-        first, *words = line.replace(",", " ").split()
+        first, *words = line.replace(",", " ").split() or [""]
         try:
             time = float(first)
         except ValueError:

@@ -87,12 +87,18 @@ def _find_charuco(shown: np.ndarray, board: tuple[int, int], charuco: Charuco) -
     corners, indices, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(
         shown, markerCorners=[np.asarray(one, np.float32)[None] for one in found], markerIds=numbers.astype(np.int32)[:, None])
     kept = np.zeros(0, int) if indices is None else np.ravel(indices)
-    if len(kept) < LEAST_SEEN or len(set(kept // board[0])) < 2 or len(set(kept % board[0])) < 2:
+    if not holds_a_pose(kept, board):
         return f"{len(kept)} corners of the ChArUco board of {name} are seen: {LEAST_SEEN} in two rows and columns or more are needed"
     every = np.full((board[0] * board[1], 2), np.nan)
     every[kept] = np.asarray(corners, np.float64).reshape(-1, 2)
     # the window of a corner must end before the markers beside it
     return refined(shown, every, board, min(SADDLE_OF_SPACING, (1 - charuco.side) / 2))
+
+
+def holds_a_pose(seen: np.ndarray, board: tuple[int, int]) -> bool:
+    """Return whether corners of a board, by their numbers along rows, hold its pose: two rows and two columns have two or more of them,
+    since a row and one corner beside it leave the pose nearly open."""
+    return len(seen) >= LEAST_SEEN and all((np.bincount(lines) >= 2).sum() >= 2 for lines in (seen // board[0], seen % board[0]))
 
 
 def _markers(shown: np.ndarray, dictionary: str) -> tuple[np.ndarray, np.ndarray]:

@@ -147,7 +147,8 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
                 break
             pairs |= found
             solved, kept = solve_all()
-        wrong = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and not targeted else {}  # targets tell turned bodies
+        told = any(pair.fit is not None for pair in targeted.values())  # by targets, which tell a body from its turned self
+        wrong = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and count <= ALL_PAIRS and not told else {}
         if wrong:
             pairs |= wrong
             solved, kept = solve_all()

@@ -31,10 +31,11 @@ def any_seen_through(poses: dict[int, np.ndarray], pairs: Iterable[tuple[int, in
 
 
 def wrongly_joined(poses: dict[int, np.ndarray], pairs: Sequence[Pair], ready: Callable[[int], Prepared]) -> dict[tuple[int, int], Pair]:
-    """Return the joined pairs that poses of scans rest on and that put them together wrongly, as contradicted ones; none where no camera
-    saw through any other scan.
+    """Return the joined pairs that poses of scans rest on and that put groups of them together wrongly, as contradicted ones; none where
+    no camera saw through any other scan.
 
-    Groups grow by the pairs with the most agreeing loops and matches first, unless scans of both would be seen through.
+    Groups grow by the pairs with the most agreeing loops and matches first, unless scans of both would be seen through. Pairs within a
+    group are left to the weights of the loops.
     """
     if not any_seen_through(poses, combinations(poses, 2), ready):
         return {}

@@ -36,7 +36,7 @@ def record(connection: sa.Connection, caller: Caller, action: str, target: str) 
 
 
 def recorded(database: Database, caller: Caller, action: str, target: str, change: Callable[[sa.Connection], T]) -> T:
-    """Make a change in a transaction of its own, write that the caller made it, unless it returns nothing, and return what it returns."""
+    """Make a change in a transaction of its own, write that the caller made it, where it returns something, and return that."""
     def work(connection: sa.Connection) -> T:
         if made := change(connection):
             record(connection, caller, action, target)

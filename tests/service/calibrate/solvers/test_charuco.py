@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from service.calibrate.solvers.charuco import DICTIONARIES, Charuco, charuco_of, find_board
+from service.calibrate.solvers.charuco import DICTIONARIES, Charuco, charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import board_points
 from service.calibrate.stereo import SharedView, calibrate_lens, calibrate_pose
 from service.requests.calibrate import BoardOptions
@@ -158,3 +158,10 @@ def test_the_command_calibrates_two_cameras_and_names_another_dictionary(relit, 
     for lens, device in ((camera, CAMERA), (other, OTHER)):
         assert np.abs(np.array(lens.focal_px) / device.focal - 1).max() < 0.01
     assert np.linalg.norm(np.array(other.camera_from_other)[:3, 3] - PLACE[:3, 3]) < 0.004
+
+
+@pytest.mark.parametrize(("seen", "held"), [([0, 1, 2, 3, 4, 5, 6, 7], False), ([0, 1, 2, 3, 7, 8, 9, 10], True), ([0, 1, 7, 8], False),
+                                            ([0, 7, 14, 21, 28, 1, 9, 17], False)])
+def test_a_line_of_corners_and_one_beside_it_hold_no_pose(seen, held):
+    """Of a board of 7x5; by a row and one corner planes came out ten degrees off at a residual of .13 pixels."""
+    assert holds_a_pose(np.array(seen), (7, 5)) is held

@@ -6,7 +6,7 @@ import { element } from "../element.js";
 const FORMATS = ["video/webm;codecs=vp9", "video/webm", "video/mp4"];
 const SECONDS = 6;
 const PICTURES_PER_S = 30;
-const LAST_MS = 2000 / PICTURES_PER_S; // a recorder that stops at once leaves out what was drawn last
+const LAST_MS = 250; // a recorder that stops at once leaves out what was drawn last
 const BITS_PER_S = 8_000_000;
 
 /**
@@ -29,7 +29,7 @@ export function mountVideo(tools, name, viewer) {
  * @param {string} name Of the file, without its suffix.
  * @param {HTMLCanvasElement} canvas
  * @param {number} seconds How long it is.
- * @param {function(number): Promise<void>|void} show Shows the picture at a share of the video, 0 to 1; where it takes time, the video waits.
+ * @param {function(number): Promise<void>|void} show Shows the picture at a share of the video, 0 to 1; where it takes time, pictures are left out.
  */
 export function offerVideo(tools, name, canvas, seconds, show) {
   const format = FORMATS.find((each) => globalThis.MediaRecorder?.isTypeSupported(each));
