@@ -3,6 +3,8 @@
 These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.dbos_tables writes.
 """
 
+import time
+
 import pytest
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
@@ -20,6 +22,7 @@ def test_workers_take_jobs_by_priority_and_time_and_projects_take_turns(tmp_path
     """The next project is drawn by lot, so that the job of `willow` is the last of all once in 2**16 runs."""
     with harness(tmp_path) as made:
         def submit(project, priority=0):
+            time.sleep(0.002)  # DBOS orders jobs by the millisecond
             request = SolveJob(kind="solve", capture=new_id(CAPTURE), priority=priority)  # of no capture: it fails at once
             return made.database.transact(lambda connection: made.queue.submit(
                 connection, project=project, key=None, request=request, chunk_frames=1, inputs=[]))
