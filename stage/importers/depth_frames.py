@@ -58,10 +58,12 @@ def frame_layout(folder: Path) -> FrameLayout | None:
         names = [path.name for path in folder.iterdir()]
     if any(name.lower().endswith(DEPTH) for name in names):
         return FrameLayout.BESIDE
+    if not (folder / "depth").is_dir():
+        return None
     if TUM_LIST in names:
         return FrameLayout.TUM
     told = any((folder / name).is_dir() for name in COLOUR_FOLDERS) or any(name.lower().endswith(".log") for name in names)
-    return FrameLayout.REDWOOD if told and (folder / "depth").is_dir() and _depth_names(folder / "depth") else None
+    return FrameLayout.REDWOOD if told and _depth_names(folder / "depth") else None
 
 
 def read_frames(folder: Path, layout: FrameLayout, poses: Path | None = None) -> list[Frame]:

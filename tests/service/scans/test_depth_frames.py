@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stage.formats.ply import read_ply
+from stage.importers.depth_frames import frame_layout
 from stage.results.depth_maps import DepthMaps
 from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import View, figure, turntable
@@ -151,3 +152,9 @@ def test_a_turntable_of_depth_results_is_written_by_options(relit, tmp_path, vie
     assert read_scan_set(tmp_path / "open")[1].turntable.angles_deg is None
     assert "3 angles" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "0,1,2", *table)
     assert "axis" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "40")
+
+
+def test_a_list_without_depth_images_is_no_depth_camera(tmp_path):
+    (tmp_path / "depth.txt").write_text("3 m of water\n")
+    (tmp_path / "1.png").write_bytes(b"")
+    assert frame_layout(tmp_path) is None
