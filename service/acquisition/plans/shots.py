@@ -111,9 +111,9 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
 
 def _refuse_some_exposures(shots: Sequence[Shot]) -> None:
     """Refuse a plan whose captures would have exposure times for some of their frames alone."""
-    for folder in {shot.folder for shot in shots}:
+    for folder in dict.fromkeys(shot.folder for shot in shots):  # in the order of the plan
         frames = [shot for shot in shots if shot.folder == folder and (shot.light is not None or shot.pattern is not None)]
-        without = [shot.name for shot in frames if shot.exposure_s is None]
+        without = [shot.key for shot in frames if shot.exposure_s is None]
         if 0 < len(without) < len(frames):
             raise RequestError(f"the plan has exposures_s for some pictures of a capture and none for {without[0]}: give them to all of "
                                "its sequences or to none")

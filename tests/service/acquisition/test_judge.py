@@ -185,10 +185,16 @@ def test_each_lamp_alone_at_each_exposure_with_tracking_between():
     assert len({shot.key for shot in found}) == len(found)
 
 
+BRACKETS = {take: [{"take": take}, {"take": take, "exposures_s": [0.1]}] for take in ("olat", "mirror-ball")}
+"""Sequences of which only the second says for how long; the first of a plan is named."""
+
+
 @pytest.mark.parametrize(("sequences", "words"), [
     ([{"take": "olat", "lights": ["L9"]}], "no lamp L9"), ([{"take": "patterns", "code": "gray"}], "--projector"),
     ([{"take": "flat"}, {"take": "flat"}], "several flat"),
-    ([{"take": "dark"}, {"take": "olat", "exposures_s": [0.1]}], "none for dark")])
+    ([{"take": "dark"}, {"take": "olat", "exposures_s": [0.1]}], "none for dark"),
+    *((BRACKETS[take] + BRACKETS[other], f"none for {first}") for take, other, first in
+      [("olat", "mirror-ball", "light_001:"), ("mirror-ball", "olat", "mirror-ball/light_001:")])])
 def test_what_cannot_be_taken_is_refused(sequences, words):
     with pytest.raises(RequestError, match=words):
         shots(*sequences)
