@@ -50,19 +50,14 @@ def asked(way: str) -> Iterator[tuple[str, Asked]]:
 
 def asked_rows() -> list[str]:
     """Return the section as lines of Markdown."""
-    lines = ["Counted on the emulated device, so that these figures depend on no machine: `tests/device_counts.txt`, which tests "
-             "compare with every run: exactly, but for stages that iterate to a residual, whose counts may be off by a quarter. "
-             f"Scenes have {SIDES[1]} and {SIDES[2]} pixels along the shorter side; a cell with two numbers has that of each, one with "
-             f"one "
-             "number the same at both. A graph is one launch, and the kernels in it are counted beside it. Bytes are those that each "
-             "further "
-             f"pixel of the larger scene asks for (MP: megapixel of the capture). The scenes of solves and relit frames have {LIGHTS} "
-             f"lights, "
-             f"a captured pixel of them {LIGHTS * 3 * HALF} bytes. What is bounded by a number of pixels or patches (those of bounced "
-             f"light: "
-             f"{PATCHES} here, {interreflection.PATCHES} in captures) is as much at both sizes, and so no part of these bytes. Each "
-             f"scene fits one batch: the numbers of launches and waits of "
-             "12 megapixels are in the section above.", "", HEAD]
+    lines = ["Counted on the emulated device, so that these figures depend on no machine: `tests/device_counts.txt`, which tests compare "
+             "with every run: exactly, but for stages that iterate to a residual, whose counts may be off by a quarter. Scenes have "
+             f"{SIDES[1]} and {SIDES[2]} pixels along the shorter side; a cell with two numbers has that of each, one with one number the "
+             "same at both. A graph is one launch, and the kernels in it are counted beside it. Bytes are those that each further pixel "
+             f"of the larger scene asks for (MP: megapixel of the capture). The scenes of solves and relit frames have {LIGHTS} lights, a "
+             f"captured pixel of them {LIGHTS * 3 * HALF} bytes. What is bounded by a number of pixels or patches (those of bounced light: "
+             f"{PATCHES} here, {interreflection.PATCHES} in captures) is as much at both sizes, and so no part of these bytes. Each scene "
+             "fits one batch: the numbers of launches and waits of 12 megapixels are in the section above.", "", HEAD]
     for way in WAYS:
         captured = next(row.captured for row in read() if row.way == way and row.side == SIDES[1]) / WAYS[way].pixels(SIDES[1])
         for stage, found in asked(way):

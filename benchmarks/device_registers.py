@@ -46,21 +46,14 @@ def register_rows() -> list[str]:
     """Return the section as lines of Markdown."""
     lines = [f"Kernels of `tests/kernels/cuda_resources.txt` with more than {BOUND} registers, compiled for sm_{H100} as they are, and by "
              f"launch bounds held to {BOUND}, of which four blocks of {CUDA_BLOCK} threads have enough. Not measured: read from the "
-             f"machine "
-             "code. A multiprocessor has 65536 registers and four schedulers, which issue an instruction a cycle each; `stall` is the "
-             "mean of "
-             "the cycles that the compiler lets pass after an instruction before the next of the same warp (bits 105 to 108 of each; "
-             "Jia and "
-             "others, \"Dissecting the NVIDIA Volta GPU architecture via microbenchmarking\", 2018, section 2.1). A scheduler with w "
-             "warps "
-             "takes max(instructions, instructions · stall / w) cycles for each warp: more warps win nothing once w reaches the stall, "
-             "and "
-             "instructions that spill and reload only cost. Each instruction counts once, also in loops; waits for memory are left out, "
-             "of "
-             "which more warps hide more, and spills add some.", "",
-             "| kernel | registers | warps | instructions | stall | cycles | held: warps | spilled bytes of a thread | spill "
-             "instructions | "
-             "instructions | stall | cycles | cycles, held over as they are |", "|" + "---|" * 13]
+             "machine code. A multiprocessor has 65536 registers and four schedulers, which issue an instruction a cycle each; `stall` is "
+             "the mean of the cycles that the compiler lets pass after an instruction before the next of the same warp (bits 105 to 108 "
+             "of each; Jia and others, \"Dissecting the NVIDIA Volta GPU architecture via microbenchmarking\", 2018, section 2.1). A "
+             "scheduler with w warps takes max(instructions, instructions · stall / w) cycles for each warp: more warps win nothing once "
+             "w reaches the stall, and instructions that spill and reload only cost. Each instruction counts once, also in loops; waits "
+             "for memory are left out, of which more warps hide more, and spills add some.", "",
+             "| kernel | registers | warps | instructions | stall | cycles | held: warps | spilled bytes of a thread | spill instructions "
+             "| instructions | stall | cycles | cycles, held over as they are |", "|" + "---|" * 13]
     for name, known in HOT.items():
         if known.registers > BOUND:
             (now, issue), (held, other) = compiled(name, None), compiled(name, 4)

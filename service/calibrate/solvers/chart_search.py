@@ -61,7 +61,7 @@ def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
             along = ((x - ends[0, 0]) * u + (y - ends[0, 1]) * v) / (u * u + v * v)
             for share in CUTS:
                 for part in _detected(np.where((along > share)[..., None], np.uint8(0), shown), patches):
-                            yield (part + 0.5) * max(step, 1.0)
+                    yield (part + 0.5) * max(step, 1.0)
 
 
 def _detected(shown: np.ndarray, patches: int) -> Iterator[np.ndarray]:

@@ -52,9 +52,9 @@ class LightPlane(NamedTuple):
 
 
 def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
-    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row, NaN where one is not
-    seen. `board`: its inner corners across and
-    down. `camera`: a calibrated perspective one."""
+    """Return the plane of a chessboard.
+    `corners`: [across × down, 2] image coordinates, row by row, NaN where one is not seen. `board`: its inner corners across and down.
+    `camera`: a calibrated perspective one."""
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
     seen_corners = np.isfinite(corners).all(axis=-1)
     corners = corners[seen_corners]

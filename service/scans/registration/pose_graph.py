@@ -191,16 +191,22 @@ def joined_groups(count: int, pairs: Iterable[Pair]) -> list[set[int]]:
     return sorted(groups, key=lambda members: (-len(members), min(members)))
 
 
-def worths(pairs: Sequence[Pair]) -> dict[tuple[int, int], float]:
-    """Return what joined pairs are worth, by both orders of their scans: the more loops of three agree, and the more points match."""
-    relative: dict[tuple[int, int], np.ndarray] = {}
-    beside: dict[int, set[int]] = defaultdict(set)
-    worth: dict[tuple[int, int], float] = {}
+def _relative(pairs: Sequence[Pair]) -> dict[tuple[int, int], np.ndarray]:
+    """Return the poses [4, 4] of joined pairs by both orders of their scans."""
+    relative = {}
     for pair in pairs:
         assert pair.fit is not None
         relative[pair.a, pair.b], relative[pair.b, pair.a] = pair.fit.pose, inverse(pair.fit.pose)
-        beside[pair.a].add(pair.b)
-        beside[pair.b].add(pair.a)
+    return relative
+
+
+def worths(pairs: Sequence[Pair]) -> dict[tuple[int, int], float]:
+    """Return what joined pairs are worth, by both orders of their scans: the more loops of three agree, and the more points match."""
+    relative = _relative(pairs)
+    beside: dict[int, set[int]] = defaultdict(set)
+    for a, b in relative:
+        beside[a].add(b)
+    worth: dict[tuple[int, int], float] = {}
     for pair in pairs:
         assert pair.fit is not None
         loops = [_closed(relative[pair.a, pair.b], relative[pair.b, third], relative[third, pair.a], pair.fit.pivot)
@@ -212,11 +218,7 @@ def worths(pairs: Sequence[Pair]) -> dict[tuple[int, int], float]:
 
 def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
     """Return first poses: along the joined pairs that are worth most, from that of the reference."""
-    worth = worths(pairs)
-    relative: dict[tuple[int, int], np.ndarray] = {}
-    for pair in pairs:
-        assert pair.fit is not None
-        relative[pair.a, pair.b], relative[pair.b, pair.a] = pair.fit.pose, inverse(pair.fit.pose)
+    worth, relative = worths(pairs), _relative(pairs)
     poses = {reference: pose}
     while len(poses) < len(members):
         a, b = max(((a, b) for a, b in relative if a in poses and b not in poses), key=lambda ab: (worth[ab], -ab[0], -ab[1]))

@@ -163,5 +163,5 @@ def test_the_command_calibrates_two_cameras_and_names_another_dictionary(relit, 
 @pytest.mark.parametrize(("seen", "held"), [([0, 1, 2, 3, 4, 5, 6, 7], False), ([0, 1, 2, 3, 7, 8, 9, 10], True), ([0, 1, 7, 8], False),
                                             ([0, 7, 14, 21, 28, 1, 9, 17], False)])
 def test_a_line_of_corners_and_one_beside_it_hold_no_pose(seen, held):
-    """Of a board of 7x5; by a row and one corner planes came out ten degrees off at a residual of .13 pixels."""
+    """A view of one row and one corner of a 7x5 board turned its plane by ten degrees at a residual of .13 pixels."""
     assert holds_a_pose(np.array(seen), (7, 5)) is held
