@@ -251,7 +251,7 @@ def test_a_service_that_is_lost_ends_no_capture(capture, stage, tmp_path, client
     between.breaks = lost
     monkeypatch.setattr("service.cli.sending.Client", lambda url, key: Client(url, key, patience_s=0.1, transport=between))
     outcome = capture()
-    assert outcome.code == 2 and "the capture is whole here: run the same command again to send the rest" in outcome.err
+    assert outcome.code == 2 and "whole here: run the same command again to send the rest" in outcome.err
     assert len(list((tmp_path / "capture").glob("*.exr"))) == LAMPS + 1
     between.inner, between.breaks = httpx2.HTTPTransport(), lambda sent, send: send()  # the client has closed the one before
     assert client.captures.get(identifier(capture().well())).facts["frames"] == LAMPS + 1

@@ -166,7 +166,7 @@ def test_the_beauty_is_premultiplied_by_its_matte(relit, tmp_path):
     soft, out = frame("soft", "--exposure", "1", "--report", tmp_path / "r.json")
     hard, _ = frame("hard", "--matte", "mask")
     plain, _ = frame("plain", "--matte", "none", "--parts", "multi")
-    assert "matte    soft, estimated from the captured images along the border of the mask\n" in out
+    assert "matte    soft, estimated from the captured images" in out
     assert json.loads((tmp_path / "r.json").read_text())["matte"] == {"images": 1}
     assert "A" not in plain and np.array_equal(hard["A"], scene.coverage > 0.5)
     partly = (scene.coverage > 0) & (scene.coverage < 1)
@@ -214,7 +214,7 @@ def test_maps_without_height_have_no_depth(relit, lit, tmp_path):
     write_maps(tmp_path / "maps", height=None)
     outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f" / "a.#.exr",
                     "--maps", tmp_path / "maps", "--aov", "depth")
-    assert outcome.code == 2 and outcome.err == f"relit: {tmp_path}/maps/maps.exr: has no layer height, which --aov depth needs\n"
+    assert outcome.code == 2 and outcome.err == f"relit: {tmp_path / 'maps' / 'maps.exr'}: has no layer height, which --aov depth needs\n"
 
 
 @pytest.mark.parametrize(("rate", "number", "fraction", "code"), [

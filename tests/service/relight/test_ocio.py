@@ -134,7 +134,7 @@ def test_a_client_reads_a_job_in_a_space_that_its_own_configuration_lacks(monkey
     monkeypatch.delenv(VARIABLE)
     text = json.dumps({**view, "request": request})
     assert JobView.model_validate_json(text).request.options.color_space == request["options"]["color_space"]
-    with pytest.raises(ValueError, match="is no colour space of the OpenColorIO configuration ocio://default"):
+    with pytest.raises(ValueError, match=r"is no colour space of .* ocio://default"):
         RelightJob.model_validate(asked)  # a request is checked as ever
 
 

@@ -133,12 +133,11 @@ def test_maps_that_do_not_fit(relit, lit, tmp_path):
     assert relit("solve", tmp_path / "small", "--method", "lambert", "--out", tmp_path / "maps").code == 0
     outcome, out = lit("out", "--aov", "normal", "--maps", tmp_path / "maps")
     assert (outcome.code, out.exists()) == (2, False)
-    assert outcome.err == (f"relit: {tmp_path}/maps/maps.exr: is 8x8, the capture 16x16: these are not its maps "
-                           "(--crop gives the part of the images that was solved)\n")
+    assert outcome.err.startswith(f"relit: {tmp_path / 'maps' / 'maps.exr'}: is 8x8, the capture 16x16: ") and "--crop" in outcome.err
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
     SurfaceMaps(camera=maps.camera, mask=maps.mask).write(tmp_path / "maps" / "maps.exr")
     outcome, _ = lit("out", "--aov", "normal", "--maps", tmp_path / "maps", capture=tmp_path / "small")
-    assert outcome.err == f"relit: {tmp_path}/maps/maps.exr: has no layer normal, which --aov normal needs\n"
+    assert outcome.err == f"relit: {tmp_path / 'maps' / 'maps.exr'}: has no layer normal, which --aov normal needs\n"
 
 
 def test_pixels_beyond_half_are_clipped_and_counted(lit):

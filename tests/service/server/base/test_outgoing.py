@@ -35,7 +35,7 @@ def named(monkeypatch, *answers: list[str]) -> list[str]:
 
 @pytest.mark.parametrize("host", PRIVATE)
 def test_addresses_that_are_not_public_are_refused_as_numbers_and_behind_names(host, monkeypatch):
-    with pytest.raises(RequestError, match="is not a public address, and no network of the setting hook_networks has it"):
+    with pytest.raises(RequestError, match=r"is not a public address.* hook_networks"):
         require_target(f"https://{host}/x", ())
     named(monkeypatch, [host.strip("[]")])
     assert post("https://hook.test/x", b"", {}, ()) == (False, NO_ADDRESS)

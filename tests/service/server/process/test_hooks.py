@@ -290,7 +290,7 @@ def test_a_delivery_that_fails_within_relit_is_given_up_too(site, monkeypatch):
     for _ in range(14):
         site.send(8 * 3600)
     assert site.last(hook)["state"] == "given_up"
-    assert site.log(job)[-1] == f"{hook['id']} given up after 14 tries: it could not be sent: the log of the service says why"
+    assert site.log(job)[-1] .startswith(f"{hook['id']} given up after 14 tries: it could not be sent")
 
 
 def test_a_machine_without_threads_to_spare_sends_later(site, receiver, monkeypatch):
