@@ -148,7 +148,7 @@ def albedo(device: str, scene: Scene) -> Compared:
     """Albedo under the normals of least squares."""
     readings = scene.readings()
     fit = solve_lambert(scene.band, readings, scene.lights.direction)
-    return fit_albedo(scene.band, readings, fit, scene.lights).numpy()[:, :PIXELS], scene.albedo, HALF
+    return fit_albedo(scene.band, readings, fit, scene.lights).albedo.numpy()[:, :PIXELS], scene.albedo, HALF
 
 
 def near(device: str, scene: Scene) -> Compared:

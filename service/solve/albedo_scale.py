@@ -71,8 +71,10 @@ def scale_albedo(solution: Solution, request: SolveRequest, brighter: float, ove
         chosen = over_time.share_albedo_scale(chosen)
     factor = np.float32(chosen * brighter)
     solution.albedo = (solution.albedo * factor).astype(np.float16)
-    if solution.specular is not None:
-        solution.specular = (solution.specular * factor).astype(np.float16)
+    for name in ("specular", "albedo_own", "albedo_tilt"):
+        values = getattr(solution, name)
+        if values is not None:
+            setattr(solution, name, (values * factor).astype(np.float16))
     if solution.pairs is not None:
         solution.pairs = solution.pairs.copy()
         solution.pairs[..., :3] *= factor

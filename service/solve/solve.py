@@ -210,6 +210,7 @@ def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method:
         estimated=estimated,
         normal=image(solution.normal),
         diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
+        diffuse_albedo_sigma=image(solution.albedo_sigma()),
         specular=image(solution.specular),
         roughness=image(solution.roughness),
         **_lobes_of_mixtures(solution, image),

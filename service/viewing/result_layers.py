@@ -28,6 +28,7 @@ class Appearance(NamedTuple):
 SURFACE = {
     "normal": Appearance("Normals", VECTOR),
     "diffuse_albedo": Appearance("Diffuse albedo", COLOUR),
+    "diffuse_albedo_sigma": Appearance("Standard deviation of the albedo", COLOUR),
     "specular": Appearance("Specular (F0)", COLOUR),
     "roughness": Appearance("Roughness", SCALAR),
     "height": Appearance("Height", SCALAR, "m"),

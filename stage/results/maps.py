@@ -21,6 +21,7 @@ _RGB, _XYZ = ("R", "G", "B"), ("X", "Y", "Z")
 LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "normal": (_XYZ, np.float32),
     "diffuse_albedo": (_RGB, np.float16),
+    "diffuse_albedo_sigma": (_RGB, np.float16),
     "specular": (_RGB, np.float16),
     "roughness": (("Y",), np.float16),
     "abundance": (("Y",), np.float16),
@@ -51,6 +52,7 @@ class SurfaceMaps:
     mask: np.ndarray  # [rows, cols] bool, True where the solver has a result
     normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, camera frame
     diffuse_albedo: np.ndarray | None = None  # [rows, cols, 3] scene-linear, 0…1
+    diffuse_albedo_sigma: np.ndarray | None = None  # [rows, cols, 3] its standard deviation, without that of the scale of all albedo
     specular: np.ndarray | None = None  # [rows, cols, 3] F0, scene-linear, 0…1
     roughness: np.ndarray | None = None  # [rows, cols] 0…1, alpha = roughness²
     abundance: np.ndarray | None = None  # [rows, cols] share of the first of two materials; 0 where the pixel has one

@@ -70,7 +70,7 @@ def solve(solver, radiance: np.ndarray, direction: np.ndarray, irradiance: np.nd
     band = packs.upload(store(radiance), None if saturated is None else bits(saturated), device=device)
     readings = grey_readings(band, grey_factors(lights, GREY))
     fit = solver(band, readings, lights.direction)
-    albedo = fit_albedo(band, readings, fit, lights)
+    albedo = fit_albedo(band, readings, fit, lights).albedo
     scalars = (array.numpy()[:pixels] for array in fit[1:])
     return Solved(fit.normal.numpy()[:, :pixels].T, albedo.numpy()[:, :pixels].T, *scalars, unpack(readings, band)[:count, :pixels])
 

@@ -1,6 +1,7 @@
-"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light (Woodham 1980)."""
+"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light (Woodham 1980), and what its uncertainty
+follows from."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -15,15 +16,22 @@ from kernels.photometric.lambertian.near import NearLights, directions_in, fallo
 from kernels.photometric.lambertian.readings import Lights, Readings
 
 
-def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> wp.array:
+class AlbedoFit(NamedTuple):
+    """Albedo of a band; the last axis is pixels, padded to whole packs. kernels.photometric.model.misfit makes its standard deviation of the
+    others, which are relative to it."""
+
+    albedo: wp.array  # [3, pixels] float32 ρ, scene-linear; 0 where there is no normal
+    squares: wp.array  # [3, pixels] float32, sum of the squared errors that the residuals show, over that of the predicted readings
+    openness: wp.array  # [pixels] float32, variance for independent errors of the readings, relative to that under a light along the normal
+    tilt: wp.array  # [pixels] float32, relative change of the albedo where the normal tilts, per radian, along the steepest way
+
+
+def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> AlbedoFit:
     """Fit the diffuse albedo: weighted least squares of radiance = ρ/π · E · n·l in each channel.
 
     Args:
         weights: what the normal solver left in its readings: the weight of each light, 0…1.
         near_lights: directions and falloff per pixel, in place of the lights' directions, where some light is near.
-
-    Returns:
-        [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
 
     Raises:
         ArrayError: a channel that no light reaches, or lights other than the band's.
@@ -35,7 +43,8 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
     if dead:
         raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
     device = band.device
-    albedo = zeros(band.pixel_count, wp.float32, device, rows=3)
+    found = AlbedoFit(*(zeros(band.pixel_count, wp.float32, device, rows=3) for _ in range(2)),
+                      *(zeros(band.pixel_count, wp.float32, device) for _ in range(2)))
     # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
     stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
                        where=lights.scale[:, None] > 0)
@@ -43,22 +52,31 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
                    [band.values, weights.values, toward_or_none(near_lights, device), falloff_or_none(near_lights, device),
                     weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
                     wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
-                   [albedo], device=device)
-    return albedo
+                   list(found), device=device)
+    return found
 
 
 @wp.func
-def add_channel(value: float, irradiance: float, weight: float, cosine: float, above: wp.ref[float], below: wp.ref[float]):
-    """Add one light's reading to one channel's weighted least squares, Σ w E cos · value and Σ w (E cos)²."""
+def add_channel(value: float, irradiance: float, weight: float, cosine: float, above: wp.ref[float], below: wp.ref[float],
+                squares: wp.ref[float]):
+    """Add one light's reading to one channel's weighted least squares, Σ w E cos · value, Σ w (E cos)² and Σ w value²."""
     w = irradiance * weight * cosine
     above += wp.where(w > 0.0, w * value, 0.0)  # a value that is not finite has weight 0, and their product is not a number
     below += w * irradiance * cosine
+    squares += wp.where(w > 0.0, weight * value * value, 0.0)
 
 
 @wp.func
 def albedo_of(above: float, below: float) -> float:
     """Return ρ from the sums, 0 where no light counts."""
     return wp.where(below > 0.0, wp.pi * wp.max(above, 0.0) / below, 0.0)
+
+
+@wp.func
+def squares_of(above: float, below: float, squares: float) -> float:
+    """Return the squared residuals over the squared predictions, from the sums; 0 where no light counts."""
+    explained = above * above / wp.max(below, 1.0e-30)
+    return wp.where(above > 0.0, wp.max(squares - explained, 0.0) / wp.max(explained, 1.0e-30), 0.0)
 
 
 @once
@@ -78,11 +96,16 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       directions: wp.array(dtype=wp.vec3),  # [L]
                       irradiance: wp.array(dtype=wp.vec3),  # [L] in stored units
                       # outputs
-                      albedo: wp.array2d(dtype=float)):  # [3, N]
+                      albedo: wp.array2d(dtype=float),  # [3, N]
+                      squares: wp.array2d(dtype=float),  # [3, N]
+                      openness: wp.array(dtype=float),  # [N]
+                      tilt: wp.array(dtype=float)):  # [N]
         p = first + wp.tid()
         nx, ny, nz = vector_at(normal, p)
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
+        squares_r, squares_g, squares_b = float_pack(), float_pack(), float_pack()
+        sx, sy, sz, shown = float_pack(), float_pack(), float_pack(), float_pack()
         lights = directions.shape[0]
         for light in range(lights):
             red = load(values, light, p)
@@ -96,15 +119,29 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
             for k in range(pack):
                 cosine = wp.max(nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k], 0.0)
+                slope = weight[k] * cosine
                 if wp.static(near):
                     cosine = cosine * part[k]
-                add_channel(float(red[k]), er, weight[k], cosine, above_r[k], below_r[k])
-                add_channel(float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k])
-                add_channel(float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k])
+                    slope = slope * part[k] * part[k]
+                shown[k] += weight[k] * cosine * cosine
+                sx[k] += slope * lx[step * k]
+                sy[k] += slope * ly[step * k]
+                sz[k] += slope * lz[step * k]
+                add_channel(float(red[k]), er, weight[k], cosine, above_r[k], below_r[k], squares_r[k])
+                add_channel(float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k], squares_g[k])
+                add_channel(float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k], squares_b[k])
         for k in range(pack):
             pixel = p * pack + k
             albedo[0, pixel] = albedo_of(above_r[k], below_r[k])
             albedo[1, pixel] = albedo_of(above_g[k], below_g[k])
             albedo[2, pixel] = albedo_of(above_b[k], below_b[k])
+            squares[0, pixel] = squares_of(above_r[k], below_r[k], squares_r[k])
+            squares[1, pixel] = squares_of(above_g[k], below_g[k], squares_g[k])
+            squares[2, pixel] = squares_of(above_b[k], below_b[k], squares_b[k])
+            per = wp.where(shown[k] > 0.0, 1.0 / wp.max(shown[k], 1.0e-30), 0.0)
+            openness[pixel] = per
+            steep = wp.vec3(sx[k], sy[k], sz[k])
+            n = wp.vec3(nx[k], ny[k], nz[k])
+            tilt[pixel] = per * wp.length(steep - wp.dot(steep, n) * n)
 
     return albedo_kernel

@@ -60,6 +60,7 @@ class Misfit(NamedTuple):
     residuals: np.ndarray = np.array([UNKNOWN_LEVEL])  # [groups] ascending, residual variance at which the share is known
     share: np.ndarray = np.array([1.0])  # [groups] 0…1
     excess: float = 0.0  # per degree of freedom
+    albedo_excess: float = 0.0  # the same of the albedo under a given normal
 
 
 class PairFits(NamedTuple):
@@ -89,11 +90,11 @@ def measure_misfit(pairs: PairFits) -> Misfit:
     common, total = residual.prod(axis=1).sum(axis=0), 0.5 * (residual**2).sum(axis=(0, 1))
     excess = _excess(PairFits(*(values[..., evenly(spare.sum(), SPREAD_PAIRS)] for values in pairs)))
     if len(total) < LEAST_PAIRS:
-        return Misfit(level, np.array([level]), np.ones(1), excess)
+        return Misfit(level, np.array([level]), np.ones(1), *excess)
     groups = np.array_split(np.argsort(total), GROUPS)
     share = [_share(common[group], total[group]) for group in groups]
     residuals = np.array([np.median(variance.mean(axis=0)[group]) for group in groups])
-    return Misfit(level, np.maximum.accumulate(residuals), np.array(share), excess)
+    return Misfit(level, np.maximum.accumulate(residuals), np.array(share), *excess)
 
 
 def _share(common: np.ndarray, total: np.ndarray) -> float:
@@ -106,13 +107,25 @@ def _share(common: np.ndarray, total: np.ndarray) -> float:
 def standard_error(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray, agreeing: np.ndarray, misfit: Misfit) -> np.ndarray:
     """Return the standard error of normals in degrees, [pixels] float32, of which the [pixels] of a NormalFit are given."""
     across, squares, freedom = (np.asarray(values, dtype=np.float64) for values in (across, squares, freedom))
-    level = np.where(freedom > 0, misfit.level, max(misfit.level, UNKNOWN_LEVEL))
-    variance = (PRIOR * level + squares) / (PRIOR + freedom)
-    share = np.interp(np.log(np.maximum(variance, 1e-30)), np.log(np.maximum(misfit.residuals, 1e-30)), misfit.share)
-    own = across * variance * np.maximum(1 + share * misfit.excess * freedom, 0.0)
+    own = across * _variance(squares, freedom, misfit, misfit.excess)
     right = np.clip((agreeing - MAJORITY) / (CLEAR_MAJORITY - MAJORITY), 0, 1)
     sigma = np.degrees(np.sqrt(right * own + (1 - right) * np.maximum(own, WRONG_FIT**2)))
     return np.minimum(sigma, LARGEST_ERROR).astype(np.float32)
+
+
+def albedo_error(albedo: np.ndarray, squares: np.ndarray, openness: np.ndarray, freedom: np.ndarray, misfit: Misfit) -> np.ndarray:
+    """Return the standard deviation of albedo under a given normal, [3, pixels] float32, from the planes of an AlbedoFit and the `freedom`
+    of the NormalFit, [pixels]."""
+    reading = np.divide(squares, openness, out=np.zeros_like(squares), where=openness > 0)
+    return np.asarray(albedo * np.sqrt(openness * _variance(reading, freedom, misfit, misfit.albedo_excess)), dtype=np.float32)
+
+
+def _variance(squares: np.ndarray, freedom: np.ndarray, misfit: Misfit, excess: float) -> np.ndarray:
+    """Return the variance of a reading whose misfit would cause as much error if it were independent between lights, relative to |b|²."""
+    level = np.where(freedom > 0, misfit.level, max(misfit.level, UNKNOWN_LEVEL))
+    variance = (PRIOR * level + squares) / (PRIOR + freedom)
+    share = np.interp(np.log(np.maximum(variance, 1e-30)), np.log(np.maximum(misfit.residuals, 1e-30)), misfit.share)
+    return np.asarray(variance * np.maximum(1 + share * excess * freedom, 0.0))
 
 
 def _median_of_chi_squared(freedom: np.ndarray) -> np.ndarray:
@@ -127,13 +140,13 @@ def _residuals(pairs: PairFits) -> np.ndarray:
     return np.sqrt(pairs.weights) * (pairs.readings / np.maximum(scale, 1e-30) - cosine)
 
 
-def _excess(pairs: PairFits) -> float:
-    """Return the excess variance per degree of freedom, from the first pixel of each pair.
+def _excess(pairs: PairFits) -> tuple[float, float]:
+    """Return the excess variance of the normal and of the albedo per degree of freedom, from the first pixel of each pair.
 
     The products of the pair's residuals are matched, in the least squares sense, by those that two kinds of errors would leave: one
     independent between lights, as wrong strengths of lights are, and one smooth over them. The first kind averages out.
     """
-    gram, target, more, freedom = np.zeros((2, 2)), np.zeros(2), 0.0, 0.0
+    gram, target, more, freedom = np.zeros((2, 2)), np.zeros(2), np.zeros(2), 0.0
     residual = _residuals(pairs)
     for p in range(pairs.freedom.shape[1]):
         used = pairs.weights[:, 0, p] > 0
@@ -142,6 +155,7 @@ def _excess(pairs: PairFits) -> float:
         w, light, n = pairs.weights[used, 0, p], pairs.directions[used, :, 0, p], pairs.normal[:, 0, p]
         gain = np.linalg.pinv((w[:, None] * light).T @ light) @ (w[:, None] * light).T  # [3, lights]: from readings to b
         across = gain - np.outer(n, n @ gain)
+        along = (w * (light @ n))[None]  # [1, lights]: from readings to the albedo under the normal n, but for a factor
         smooth = np.exp(-0.5 * (np.arccos(np.clip(light @ light.T, -1, 1)) / SMOOTHNESS) ** 2)
         kinds = np.stack([_left(np.eye(len(w)), light, gain), _left(smooth, light, gain)]) * np.sqrt(np.outer(w, w))
         seen = np.trace(kinds, axis1=1, axis2=2)
@@ -151,15 +165,16 @@ def _excess(pairs: PairFits) -> float:
         product = np.outer(*residual[used][:, :, p].T)
         gram += np.einsum("aij,bij->ab", kinds, kinds)
         target += np.einsum("aij,ij->a", kinds, product) / max(0.5 * (residual[:, :, p] ** 2).sum(), 1e-30)
-        more += seen[0] * ((across @ smooth) * across).sum() / seen[1] / max((across**2).sum(), 1e-30) - 1
+        more += [seen[0] * ((map_ @ smooth) * map_).sum() / seen[1] / max((map_**2).sum(), 1e-30) - 1 for map_ in (across, along)]
         freedom += pairs.freedom[0, p]
     if freedom == 0:
-        return 0.0
+        return 0.0, 0.0
     part = np.linalg.lstsq(gram, target, rcond=None)[0]
     if part[0] < 0:  # least squares with parts of at least 0
         part = np.array([0.0, 1.0])
     share = np.clip(part[1], 0, None) / max(np.clip(part, 0, None).sum(), 1e-30)
-    return float(max(share * more / freedom, 0.0))
+    normal, albedo = np.maximum(share * more / freedom, 0.0)
+    return float(normal), float(albedo)
 
 
 def _left(errors: np.ndarray, light: np.ndarray, gain: np.ndarray) -> np.ndarray:

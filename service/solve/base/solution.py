@@ -87,6 +87,8 @@ class Solution:
     sigma: np.ndarray  # [pixels] float16, standard error of the normal: the RMS angle to the true one, degrees
     residual: np.ndarray  # [pixels] float16
     status: np.ndarray  # [pixels] uint8
+    albedo_own: np.ndarray | None = None  # [3, pixels] float16, standard deviation of the albedo where the normal is right; None: unknown
+    albedo_tilt: np.ndarray | None = None  # [3, pixels] float16, change of the albedo for each degree that the normal is off; with the above
     specular: np.ndarray | None = None  # [3, pixels] float16, F0
     roughness: np.ndarray | None = None  # [pixels] float16
     abundance: np.ndarray | None = None  # [pixels] float16, share of the first of two materials; 0 where the pixel has one
@@ -110,6 +112,13 @@ class Solution:
     def standard_error(self) -> np.ndarray:
         """Return the standard error of the normals in degrees, [pixels] float32."""
         return self.sigma.astype(np.float32)
+
+    def albedo_sigma(self) -> np.ndarray | None:
+        """Return the standard deviation of the albedo, [3, pixels] float16, without that of its scale; None where it is not known."""
+        if self.albedo_own is None or self.albedo_tilt is None:
+            return None
+        sigma = np.hypot(self.albedo_own.astype(np.float32), self.albedo_tilt * self.standard_error())
+        return np.minimum(sigma, np.finfo(np.float16).max).astype(np.float16)
 
     @property
     def confidence(self) -> np.ndarray:

@@ -8,7 +8,7 @@ from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearField, see_near
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
-from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit, standard_error
+from kernels.photometric.model.misfit import Misfit, PairFits, albedo_error, measure_misfit, standard_error
 from kernels.photometric.model.samples import evenly
 from kernels.status import Status
 from service.sharing.sharing import Results
@@ -27,6 +27,7 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     `fit_normals`: `solve_lambert` or `solve_robust`, which fits the normals of a band."""
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
+    own, tilt = result.albedo_own, result.albedo_tilt = np.zeros_like(result.albedo), np.zeros_like(result.albedo)
     misfit = _object_misfit(given, lights, field, fit_normals=fit_normals)
 
     def solve(read: ReadBand) -> None:
@@ -34,13 +35,16 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
-        evidence = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
-        result.sigma[span] = np.where(solved, standard_error(*evidence, misfit), 0)
-        albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
+        across, squared, freedom, agreeing = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
+        result.sigma[span] = np.where(solved, standard_error(across, squared, freedom, agreeing, misfit), 0)
+        found = fit_albedo(band, readings, fit, lights, near)
+        albedo, squares, openness, steep = (array.numpy()[..., : len(inside)] for array in found)
         result.albedo[:, span] = np.where(inside, albedo, 0)
+        own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, freedom, misfit), 0)
+        tilt[:, span] = np.where(solved, albedo * np.radians(steep) / np.sqrt(2), 0)  # half of σ² is along the steepest way
 
     each_band(given, lights, field, solve,
-              Results((result.normal, result.albedo, result.sigma, result.residual, result.status), misfit))
+              Results((result.normal, result.albedo, result.sigma, result.residual, result.status, own, tilt), misfit))
     return result
 
 

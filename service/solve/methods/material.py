@@ -13,6 +13,7 @@ from kernels.photometric.lambertian.lambert import solve_lambert
 from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.lambertian.robust import solve_robust
+from kernels.photometric.material.albedo_error import albedo_error
 from kernels.photometric.material.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.material.metal_search import Metals, metals_of
 from kernels.photometric.material.mixtures import HELD, NO_PAIRS, choose_pairs
@@ -239,6 +240,7 @@ class _Walk:
         sigma = self.result.sigma
         sigma[:] = LARGEST_ERROR
         abundance, pair, unseen = np.zeros(count, np.float16), np.zeros(count, np.uint8), np.zeros(count, np.float16)
+        own, tilt = np.zeros_like(result.albedo), np.zeros_like(result.albedo)
         light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
 
         def fit(batch: Batch) -> None:
@@ -253,13 +255,15 @@ class _Walk:
             result.albedo[:, pixels] = material.diffuse_albedo.T
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
+            error = albedo_error(samples, found.normal, material, shape=self._lobe, shared=MATT[None] if self._matt else materials)
+            own[:, pixels], tilt[:, pixels] = error.own.T, error.tilt.T
             abundance[pixels], pair[pixels] = found.mixture
             sigma[pixels], unseen[pixels], result.residual[pixels] = found.sigma, found.unseen, found.residual
 
         self._batches("normals", fit, Results(
-            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, unseen, result.residual),
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, unseen, result.residual, own, tilt),
             (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
-        result.unseen = unseen
+        result.unseen, result.albedo_own, result.albedo_tilt = unseen, own, tilt
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
             result.facts["mixed_pixels"] = int(mixed.sum())

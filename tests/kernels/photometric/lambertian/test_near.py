@@ -73,7 +73,7 @@ def test_normals_and_albedo_at_known_points(solver, device):
     readings = grey_readings(band, grey_factors(lights(), GREY))
     near = see_near(band, readings, field())
     fit = solver(band, readings, lights().direction, near)
-    albedo = fit_albedo(band, readings, fit, lights(), near)
+    albedo = fit_albedo(band, readings, fit, lights(), near).albedo
     assert (fit.status.numpy()[:PIXELS] == Status.OK).all()
     assert angle_degrees(fit.normal.numpy()[:, :PIXELS].T, NORMALS).max() < 0.1  # half rounding of eight readings or more
     np.testing.assert_allclose(albedo.numpy()[:, :PIXELS].T, ALBEDO, rtol=2e-3)
