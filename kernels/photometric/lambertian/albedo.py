@@ -13,7 +13,8 @@ from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, vector_at, zeros
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearLights, directions_in, falloff_or_none, toward_or_none
-from kernels.photometric.lambertian.readings import Lights, Readings
+from kernels.photometric.lambertian.readings import LARGEST, Lights, Readings
+from kernels.photometric.model.misfit import BEHIND
 
 
 class AlbedoFit(NamedTuple):
@@ -24,6 +25,7 @@ class AlbedoFit(NamedTuple):
     squares: wp.array  # [3, pixels] float32, sum of the squared errors that the residuals show, over that of the predicted readings
     openness: wp.array  # [pixels] float32, variance for independent errors of the readings, relative to that under a light along the normal
     tilt: wp.array  # [pixels] float32, relative change of the albedo where the normal tilts, per radian, along the steepest way
+    bounced: wp.array  # [pixels] float32, light from elsewhere: mean reading under lights behind the surface, relative as `openness`; -1: none
 
 
 def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> AlbedoFit:
@@ -44,7 +46,7 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
         raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
     device = band.device
     found = AlbedoFit(*(zeros(band.pixel_count, wp.float32, device, rows=3) for _ in range(2)),
-                      *(zeros(band.pixel_count, wp.float32, device) for _ in range(2)))
+                      *(zeros(band.pixel_count, wp.float32, device) for _ in range(3)))
     # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
     stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
                        where=lights.scale[:, None] > 0)
@@ -99,13 +101,15 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       albedo: wp.array2d(dtype=float),  # [3, N]
                       squares: wp.array2d(dtype=float),  # [3, N]
                       openness: wp.array(dtype=float),  # [N]
-                      tilt: wp.array(dtype=float)):  # [N]
+                      tilt: wp.array(dtype=float),  # [N]
+                      bounced: wp.array(dtype=float)):  # [N]
         p = first + wp.tid()
         nx, ny, nz = vector_at(normal, p)
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
         squares_r, squares_g, squares_b = float_pack(), float_pack(), float_pack()
         sx, sy, sz, shown = float_pack(), float_pack(), float_pack(), float_pack()
+        behind, sent_r, sent_g, sent_b = float_pack(), float_pack(), float_pack(), float_pack()
         lights = directions.shape[0]
         for light in range(lights):
             red = load(values, light, p)
@@ -118,8 +122,17 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                 part = falloff[at]
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
             for k in range(pack):
-                cosine = wp.max(nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k], 0.0)
+                facing = nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k]
+                cosine = wp.max(facing, 0.0)
                 slope = weight[k] * cosine
+                shadowed = wp.where(facing < BEHIND, 1.0, 0.0)
+                glow = float(red[k]) + float(green[k]) + float(blue[k])
+                behind[k] += wp.where(glow < LARGEST, shadowed * wp.max(glow, 0.0), 0.0)  # 0 also for NaN
+                if wp.static(near):
+                    shadowed = shadowed * part[k]
+                sent_r[k] += shadowed * er
+                sent_g[k] += shadowed * eg
+                sent_b[k] += shadowed * eb
                 if wp.static(near):
                     cosine = cosine * part[k]
                     slope = slope * part[k] * part[k]
@@ -138,6 +151,8 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
             squares[0, pixel] = squares_of(above_r[k], below_r[k], squares_r[k])
             squares[1, pixel] = squares_of(above_g[k], below_g[k], squares_g[k])
             squares[2, pixel] = squares_of(above_b[k], below_b[k], squares_b[k])
+            full = (sent_r[k] * albedo[0, pixel] + sent_g[k] * albedo[1, pixel] + sent_b[k] * albedo[2, pixel]) / wp.pi
+            bounced[pixel] = wp.where(full > 0.0, behind[k] / wp.max(full, 1.0e-30), -1.0)
             per = wp.where(shown[k] > 0.0, 1.0 / wp.max(shown[k], 1.0e-30), 0.0)
             openness[pixel] = per
             steep = wp.vec3(sx[k], sy[k], sz[k])

@@ -45,6 +45,11 @@ SPREAD_PAIRS = 128
 """Number of pairs from which the excess is computed: it depends on the lights more than on the pixel."""
 WRONG_FIT = np.radians(45.0)
 """Standard error of a normal that most readings contradict."""
+BEHIND = -0.05
+"""Cosine between normal and light below which the surface turns away from the light, three degrees beyond its horizon."""
+TURN = 1.3
+"""Angle in radians by which light from other surfaces turns a normal, for each part of the albedo that a pixel shines with under lights behind
+it: there all light is theirs, and in front of it as much is added. Measured on two path-traced objects with folds."""
 LARGEST_ERROR = 90.0
 """Degrees: a visible normal that is not known at all is hardly further off."""
 MAJORITY, CLEAR_MAJORITY = 0.5, 0.6
@@ -61,6 +66,7 @@ class Misfit(NamedTuple):
     share: np.ndarray = np.array([1.0])  # [groups] 0…1
     excess: float = 0.0  # per degree of freedom
     albedo_excess: float = 0.0  # the same of the albedo under a given normal
+    bounced: float = 0.0  # light from elsewhere, of the middle pixel that has a light behind it, relative to |b|
 
 
 class PairFits(NamedTuple):
@@ -89,12 +95,13 @@ def measure_misfit(pairs: PairFits) -> Misfit:
     residual = _residuals(pairs)
     common, total = residual.prod(axis=1).sum(axis=0), 0.5 * (residual**2).sum(axis=(0, 1))
     excess = _excess(PairFits(*(values[..., evenly(spare.sum(), SPREAD_PAIRS)] for values in pairs)))
+    bounced = _bounced(pairs)
     if len(total) < LEAST_PAIRS:
-        return Misfit(level, np.array([level]), np.ones(1), *excess)
+        return Misfit(level, np.array([level]), np.ones(1), *excess, bounced)
     groups = np.array_split(np.argsort(total), GROUPS)
     share = [_share(common[group], total[group]) for group in groups]
     residuals = np.array([np.median(variance.mean(axis=0)[group]) for group in groups])
-    return Misfit(level, np.maximum.accumulate(residuals), np.array(share), *excess)
+    return Misfit(level, np.maximum.accumulate(residuals), np.array(share), *excess, bounced)
 
 
 def _share(common: np.ndarray, total: np.ndarray) -> float:
@@ -113,11 +120,24 @@ def standard_error(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray,
     return np.minimum(sigma, LARGEST_ERROR).astype(np.float32)
 
 
-def albedo_error(albedo: np.ndarray, squares: np.ndarray, openness: np.ndarray, freedom: np.ndarray, misfit: Misfit) -> np.ndarray:
+def albedo_error(albedo: np.ndarray, squares: np.ndarray, openness: np.ndarray, bounced: np.ndarray, freedom: np.ndarray,
+                 misfit: Misfit) -> np.ndarray:
     """Return the standard deviation of albedo under a given normal, [3, pixels] float32, from the planes of an AlbedoFit and the `freedom`
     of the NormalFit, [pixels]."""
     reading = np.divide(squares, openness, out=np.zeros_like(squares), where=openness > 0)
-    return np.asarray(albedo * np.sqrt(openness * _variance(reading, freedom, misfit, misfit.albedo_excess)), dtype=np.float32)
+    variance = openness * _variance(reading, freedom, misfit, misfit.albedo_excess) + _light_from_elsewhere(bounced, misfit) ** 2
+    return np.asarray(albedo * np.sqrt(variance), dtype=np.float32)
+
+
+def with_bounced(sigma: np.ndarray, bounced: np.ndarray, misfit: Misfit) -> np.ndarray:
+    """Return the standard error of normals in degrees with that of the light which other surfaces send, `bounced` of an AlbedoFit."""
+    turned = np.degrees(TURN * _light_from_elsewhere(bounced, misfit))
+    return np.minimum(np.hypot(sigma, turned), LARGEST_ERROR).astype(np.float32)
+
+
+def _light_from_elsewhere(bounced: np.ndarray, misfit: Misfit) -> np.ndarray:
+    """Return what pixels show of it, and what the object's middle pixel shows where no light stands behind one."""
+    return np.where(bounced >= 0, bounced, misfit.bounced)
 
 
 def _variance(squares: np.ndarray, freedom: np.ndarray, misfit: Misfit, excess: float) -> np.ndarray:
@@ -133,11 +153,25 @@ def _median_of_chi_squared(freedom: np.ndarray) -> np.ndarray:
     return np.maximum(1 - 2 / (9 * np.maximum(freedom, 1.0)), 0.1) ** 3
 
 
+def _bounced(pairs: PairFits) -> float:
+    """Return the median of the mean readings under lights behind the surface, in |b|; 0 where no pixel has one."""
+    relative, cosine = _relative(pairs)
+    behind = cosine < BEHIND
+    count = behind.sum(axis=0)
+    return float(np.median((relative * behind).sum(axis=0)[count > 0] / count[count > 0])) if count.any() else 0.0
+
+
 def _residuals(pairs: PairFits) -> np.ndarray:
     """Return [lights, 2, pairs] the residuals of the fits, in |b|, times the roots of their weights."""
+    relative, cosine = _relative(pairs)
+    return np.sqrt(pairs.weights) * (relative - cosine)
+
+
+def _relative(pairs: PairFits) -> tuple[np.ndarray, np.ndarray]:
+    """Return [lights, 2, pairs] the readings in |b|, and the cosines that would be those of Lambert's law."""
     cosine = np.einsum("lcsp,csp->lsp", pairs.directions, pairs.normal)
     scale = (pairs.weights * pairs.readings * cosine).sum(axis=0) / np.maximum((pairs.weights * cosine**2).sum(axis=0), 1e-30)
-    return np.sqrt(pairs.weights) * (pairs.readings / np.maximum(scale, 1e-30) - cosine)
+    return pairs.readings / np.maximum(scale, 1e-30), cosine
 
 
 def _excess(pairs: PairFits) -> tuple[float, float]:

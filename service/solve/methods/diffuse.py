@@ -8,7 +8,7 @@ from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearField, see_near
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
-from kernels.photometric.model.misfit import Misfit, PairFits, albedo_error, measure_misfit, standard_error
+from kernels.photometric.model.misfit import Misfit, PairFits, albedo_error, measure_misfit, standard_error, with_bounced
 from kernels.photometric.model.samples import evenly
 from kernels.status import Status
 from service.sharing.sharing import Results
@@ -36,11 +36,11 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
         across, squared, freedom, agreeing = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
-        result.sigma[span] = np.where(solved, standard_error(across, squared, freedom, agreeing, misfit), 0)
         found = fit_albedo(band, readings, fit, lights, near)
-        albedo, squares, openness, steep = (array.numpy()[..., : len(inside)] for array in found)
+        albedo, squares, openness, steep, bounced = (array.numpy()[..., : len(inside)] for array in found)
+        result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, agreeing, misfit), bounced, misfit), 0)
         result.albedo[:, span] = np.where(inside, albedo, 0)
-        own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, freedom, misfit), 0)
+        own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, bounced, freedom, misfit), 0)
         tilt[:, span] = np.where(solved, albedo * np.radians(steep) / np.sqrt(2), 0)  # half of σ² is along the steepest way
 
     each_band(given, lights, field, solve,
