@@ -22,7 +22,8 @@ CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0
 
 def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
-    layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
+    layers = {"normal": three(), "diffuse_albedo": three(), "diffuse_albedo_sigma": three(), "specular": three(), "roughness": one(),
+              "height": one() - 1,
               "confidence": one(), "specular_normal": three(), "regime": one(), "sigma": one(),
               "abundance": one(), "height_sigma": one(), "first_specular": three(), "first_roughness": one(), "second_specular": three(),
               "second_roughness": one(), "part": np.ones(MASK.shape, np.uint8),
@@ -48,7 +49,8 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
     with OpenEXR.File(str(tmp_path / "maps.exr"), separate_channels=True) as file:
         types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
         header = dict(file.header())
-    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular", "first_specular", "second_specular") for c in "RGB"]
+    colours = ("diffuse_albedo", "diffuse_albedo_sigma", "specular", "first_specular", "second_specular")
+    half = [f"{layer}.{c}" for layer in colours for c in "RGB"]
     half += [f"{layer}.Y" for layer in ("roughness", "abundance", "first_roughness", "second_roughness", "regime", "part", "sigma",
                                         "confidence", "status", "mask")]
     floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z", "height_sigma.Z"]

@@ -6,6 +6,7 @@ from kernels.errors import ArrayError
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit, solve_lambert
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings, pad_lights
+from kernels.photometric.model.misfit import Misfit, albedo_error
 from kernels.status import Status
 from tests.kernels.scenes import GREY, cap, colours, rounding_bounds, shade, solve, store
 
@@ -48,6 +49,53 @@ def test_a_value_that_is_not_finite_costs_its_light_alone(lacks, bad, device):
     assert (solved.weights[5] == 0).all() and (solved.weights[6, 1::2] == 1).all()
     _, relative = rounding_bounds(normal, albedo, direction, np.ones((16, 3)), solved.weights > 0)
     assert (np.abs(solved.albedo / albedo - 1) <= 1.1 * relative[:, None] + 1e-5).all()  # one light fewer in one channel
+
+
+def solve_albedo(radiance, direction, device):
+    """The albedo of Lambertian pixels and what its error follows from, without padding, and the freedom of their normals."""
+    lights, pixels = pad_lights(direction, np.ones_like(direction)), radiance.shape[2]
+    band = packs.upload(store(radiance), device=device)
+    readings = grey_readings(band, grey_factors(lights, GREY))
+    fit = solve_lambert(band, readings, lights.direction)
+    found = [array.numpy()[..., :pixels] for array in fit_albedo(band, readings, fit, lights)]
+    return *found, fit.freedom.numpy()[:pixels]
+
+
+def test_the_error_of_the_albedo_under_a_given_normal_is_that_of_its_noise(device):
+    """400 draws of two percent on one surface: a spread of the draws is known to 4 %, that of independent readings from residuals to as much.
+    Lights all around the normal leave its error without effect on the albedo."""
+    normal, direction = np.tile([0.0, 0.0, 1.0], (400, 1)), cap(24, 60)
+    noise = 1e-2 * np.random.default_rng(1).normal(size=(3, 24, 400)) / np.pi
+    radiance = shade(normal, np.full((400, 3), 0.5), direction, np.ones((24, 3))) + noise
+    found, squares, openness, _, bounced, freedom = solve_albedo(radiance, direction, device)
+    sigma = albedo_error(found, squares, openness, bounced, freedom, Misfit(level=4e-4, share=np.zeros(1), residuals=np.array([4e-4])))
+    np.testing.assert_allclose(np.sqrt((sigma**2).mean(axis=1)), found.std(axis=1), rtol=0.12)
+    assert (bounced == -1).all()  # all lights stand before the surface
+
+
+def test_albedo_follows_a_tilted_normal_by_the_slope_that_is_told(device):
+    """Under lights from one side a normal that turns by a small angle along the steepest way changes the albedo by that much of it. Tolerance:
+    the second order of one degree, and halves."""
+    direction = cap(24, 50) + [0.8, 0.0, 0.0]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    cosine = direction[:, 2]
+    slope = (cosine[:, None] * direction)[:, :2].sum(axis=0) / (cosine**2).sum()
+    turned = np.radians(1.0) * slope / np.linalg.norm(slope)
+    tilted = np.array([*turned, 1.0]) / np.linalg.norm([*turned, 1.0])
+    readings = shade(np.array([[0.0, 0.0, 1.0]]), np.full((1, 3), 0.5), direction, np.ones((24, 3)))
+    expected = (readings[0, :, 0] * (direction @ tilted)).sum() / ((direction @ tilted) ** 2).sum() * np.pi
+    _, _, _, tilt, _, _ = solve_albedo(readings, direction, device)
+    assert tilt[0] * np.radians(1.0) == pytest.approx(abs(expected / 0.5 - 1), rel=0.03)
+
+
+def test_light_under_lights_behind_the_surface_is_measured(device):
+    """A third of the lights stands behind the surface, where each reading is 4 % of that along the normal."""
+    direction = cap(48, 120)
+    radiance = shade(np.tile([0.0, 0.0, 1.0], (5, 1)), np.full((5, 3), 0.5), direction, np.ones((48, 3)))
+    glow = np.where(direction[:, 2] < 0, 0.04 * 0.5 / np.pi, 0)[None, :, None]
+    _, _, _, _, bounced, _ = solve_albedo(radiance + glow, direction, device)
+    # least squares over readings from behind turn nothing and dim the albedo by some percent of 4 %
+    np.testing.assert_allclose(bounced, 0.04, rtol=0.05)
 
 
 def test_negative_channels_give_albedo_zero(device):
