@@ -14,18 +14,20 @@ from kernels.packs import Band, as_packs, pack_type, vector_at, zeros
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearLights, directions_in, falloff_or_none, toward_or_none
 from kernels.photometric.lambertian.readings import LARGEST, Lights, Readings
-from kernels.photometric.model.misfit import BEHIND
+
+BEHIND = -0.05
+"""Cosine between normal and light below which the surface turns away from the light, three degrees beyond its horizon."""
 
 
 class AlbedoFit(NamedTuple):
-    """Albedo of a band; the last axis is pixels, padded to whole packs. kernels.photometric.model.misfit makes its standard deviation of the
-    others, which are relative to it."""
+    """Albedo of a band; the last axis is pixels, padded to whole packs. kernels.photometric.model.misfit makes its standard deviation of
+    the others, which are relative to it."""
 
     albedo: wp.array  # [3, pixels] float32 ρ, scene-linear; 0 where there is no normal
     squares: wp.array  # [3, pixels] float32, sum of the squared errors that the residuals show, over that of the predicted readings
     openness: wp.array  # [pixels] float32, variance for independent errors of the readings, relative to that under a light along the normal
     tilt: wp.array  # [pixels] float32, relative change of the albedo where the normal tilts, per radian, along the steepest way
-    bounced: wp.array  # [pixels] float32, light from elsewhere: mean reading under lights behind the surface, relative as `openness`; -1: none
+    bounced: wp.array  # [pixels] float32, mean reading under lights behind the surface, relative as `openness`; -1: there is none
 
 
 def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> AlbedoFit:

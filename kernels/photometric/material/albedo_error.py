@@ -1,7 +1,7 @@
 """The standard deviation of the albedo of a fitted material: what the readings leave open, and how it follows the normal.
 
-Given the normal, a reading of a channel is y = ρ f_d + F0 (1 - s) f_s + s f_s. The variance of ρ is that of weighted least squares in which F0
-and roughness are unknown too: the mean squared residual, by the weights of the robust fit, times the element of the inverse normal
+Given the normal, a reading of a channel is y = ρ f_d + F0 (1 - s) f_s + s f_s. The variance of ρ is that of weighted least squares in
+which F0 and roughness are unknown too: the mean squared residual, by the weights of the robust fit, times the element of the inverse normal
 equations. Dielectrics of an object have nearly the same F0, so a pixel's may be off by a part of it, and by as much as it lies from those
 that the object shares; a metal's own lobe alone bounds it. Misfit beyond the noise of a camera is alike under neighbouring lights, as in
 `certainty`, and many lights hardly average it.
@@ -78,7 +78,7 @@ class AlbedoError(NamedTuple):
 def albedo_error(samples: Samples, normal: np.ndarray, fitted: FittedMaterial, *, shape: Diffuse,
                  shared: np.ndarray | None) -> AlbedoError:
     """Return how far the diffuse albedo of fitted materials may be off; waits for the device.
-    `normal`: [n, 3] unit. `fitted`: fitted to it with this `shape`. `shared`: [materials, 4] F0 and roughness that pixels share, or None."""
+    `normal`: [n, 3] unit. `fitted`: fitted to it with this `shape`. `shared`: [materials, 4] F0 and roughness of pixels, or None."""
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     sums = wp.empty((SUMS, packs), dtype=pack_type(lanes, wp.float32), device=device)
     given = np.concatenate([normal, fitted.diffuse_albedo, fitted.specular, fitted.roughness[:, None]], axis=1)
@@ -129,7 +129,7 @@ def _sums_kernel(lanes: int) -> Any:
         p = first + wp.tid()
         nx, ny, nz = vector_at(fitted, p)
         vx, vy, vz = vector_at(samples.view, p)
-        rough, bright = fitted[9, p], samples.level[p]
+        rough = fitted[9, p]
         write_weights(samples, criteria.noise, p, 0, scratch)
         closest = lambertian(samples, criteria.form, nx, ny, nz, p)
         rho, f0 = channels(), channels()

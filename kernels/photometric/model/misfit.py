@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
+from kernels.photometric.lambertian.albedo import BEHIND
 from kernels.photometric.model.samples import evenly
 
 SMOOTHNESS = np.radians(32.0)
@@ -45,11 +46,9 @@ SPREAD_PAIRS = 128
 """Number of pairs from which the excess is computed: it depends on the lights more than on the pixel."""
 WRONG_FIT = np.radians(45.0)
 """Standard error of a normal that most readings contradict."""
-BEHIND = -0.05
-"""Cosine between normal and light below which the surface turns away from the light, three degrees beyond its horizon."""
 TURN = 1.3
-"""Angle in radians by which light from other surfaces turns a normal, for each part of the albedo that a pixel shines with under lights behind
-it: there all light is theirs, and in front of it as much is added. Measured on two path-traced objects with folds."""
+"""Angle in radians by which light from other surfaces turns a normal, for each part of the albedo that a pixel shines with under lights
+behind it: there all light is theirs, and in front of it as much is added. Measured on two path-traced objects with folds."""
 LARGEST_ERROR = 90.0
 """Degrees: a visible normal that is not known at all is hardly further off."""
 MAJORITY, CLEAR_MAJORITY = 0.5, 0.6

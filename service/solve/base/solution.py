@@ -88,7 +88,7 @@ class Solution:
     residual: np.ndarray  # [pixels] float16
     status: np.ndarray  # [pixels] uint8
     albedo_own: np.ndarray | None = None  # [3, pixels] float16, standard deviation of the albedo where the normal is right; None: unknown
-    albedo_tilt: np.ndarray | None = None  # [3, pixels] float16, change of the albedo for each degree that the normal is off; with the above
+    albedo_tilt: np.ndarray | None = None  # [3, pixels] float16, change of it for each degree that the normal is off; None: likewise
     specular: np.ndarray | None = None  # [3, pixels] float16, F0
     roughness: np.ndarray | None = None  # [pixels] float16
     abundance: np.ndarray | None = None  # [pixels] float16, share of the first of two materials; 0 where the pixel has one

@@ -35,7 +35,8 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
-        across, squared, freedom, agreeing = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
+        evidence = fit.across, fit.squares, fit.freedom, fit.agreeing
+        across, squared, freedom, agreeing = (array.numpy()[: len(inside)] for array in evidence)
         found = fit_albedo(band, readings, fit, lights, near)
         albedo, squares, openness, steep, bounced = (array.numpy()[..., : len(inside)] for array in found)
         result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, agreeing, misfit), bounced, misfit), 0)

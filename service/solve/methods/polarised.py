@@ -116,7 +116,7 @@ def _solve_metals(given: SolveInput, lights: Lights, field: NearField | None, di
     assert given.pairs is not None
     whole = replace(given, stack=given.pairs.whole, mask=metal.reshape(given.mask.shape), pairs=None)
     found = solver(whole, lights._replace(scale=given.pairs.whole.scale), field)
-    for name in ("normal", "specular", "roughness", "residual", "status", "sigma"):
+    for name in ("normal", "specular", "roughness", "residual", "status", "sigma", "albedo_own", "albedo_tilt"):
         getattr(diffuse, name)[..., metal] = getattr(found, name)[..., metal]
     pixels = np.flatnonzero(metal & np.isin(diffuse.status, ESTIMATED))
     top, bottom = np.zeros((3, len(pixels))), np.full((3, len(pixels)), 1e-12)

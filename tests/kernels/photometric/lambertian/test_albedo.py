@@ -62,8 +62,8 @@ def solve_albedo(radiance, direction, device):
 
 
 def test_the_error_of_the_albedo_under_a_given_normal_is_that_of_its_noise(device):
-    """400 draws of two percent on one surface: a spread of the draws is known to 4 %, that of independent readings from residuals to as much.
-    Lights all around the normal leave its error without effect on the albedo."""
+    """400 draws of two percent on one surface: the spread of the draws is known to 4 %, what the residuals tell to as much. Lights all
+    around the normal leave its error without effect on the albedo."""
     normal, direction = np.tile([0.0, 0.0, 1.0], (400, 1)), cap(24, 60)
     noise = 1e-2 * np.random.default_rng(1).normal(size=(3, 24, 400)) / np.pi
     radiance = shade(normal, np.full((400, 3), 0.5), direction, np.ones((24, 3))) + noise
@@ -74,8 +74,8 @@ def test_the_error_of_the_albedo_under_a_given_normal_is_that_of_its_noise(devic
 
 
 def test_albedo_follows_a_tilted_normal_by_the_slope_that_is_told(device):
-    """Under lights from one side a normal that turns by a small angle along the steepest way changes the albedo by that much of it. Tolerance:
-    the second order of one degree, and halves."""
+    """Under lights from one side a normal that turns by a small angle along the steepest way changes the albedo by that much of it.
+    Tolerance: the second order of one degree, and halves."""
     direction = cap(24, 50) + [0.8, 0.0, 0.0]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     cosine = direction[:, 2]

@@ -26,7 +26,7 @@ def fitted(device, noise, material=PAINT, turn=0.0):
 
 
 def test_noise_of_a_camera(device):
-    """Half a percent of noise on paint whose lobe is known: the RMS of error over σ is between a half, because F0 may be a tenth off, and 1.1."""
+    """Half a percent of noise on paint whose lobe is known: the RMS of error over σ is below 1, because F0 may be a tenth off."""
     samples, normal, found = fitted(device, 0.005)
     error = found.diffuse_albedo - fitted(device, 0.0)[2].diffuse_albedo
     own = albedo_error(samples, normal, found, shape=LAMBERT, shared=PAINT[None]).own
@@ -44,8 +44,8 @@ def test_an_f0_that_no_other_pixel_shares_makes_the_albedo_unsure(device):
 
 
 def test_albedo_follows_a_tilted_normal_by_the_slope_that_is_told(device):
-    """Along one tangent the albedo changes by no more than the steepest slope, on some pixels by nearly that. Tolerance: the second order of
-    half a degree, and weights that follow the misfit."""
+    """Along one tangent the albedo changes by no more than the steepest slope, on some pixels by nearly that. Tolerance: the second order
+    of half a degree, and weights that follow the misfit."""
     degrees = 0.5
     still, moved = fitted(device, 0.0), fitted(device, 0.0, turn=np.radians(degrees))
     steep = np.sqrt(2) * degrees * albedo_error(*still, shape=LAMBERT, shared=PAINT[None]).tilt
