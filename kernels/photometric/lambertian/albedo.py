@@ -49,13 +49,11 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
     device = band.device
     found = AlbedoFit(*(zeros(band.pixel_count, wp.float32, device, rows=3) for _ in range(2)),
                       *(zeros(band.pixel_count, wp.float32, device) for _ in range(3)))
-    # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
-    stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
-                       where=lights.scale[:, None] > 0)
     devices.launch(_albedo_kernel(devices.pack_width(device), near_lights is not None), band.packs,
                    [band.values, weights.values, toward_or_none(near_lights, device), falloff_or_none(near_lights, device),
                     weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
-                    wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
+                    wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(lights.irradiance, dtype=wp.vec3, device=device),
+                    wp.array(lights.scale, dtype=wp.float32, device=device)],
                    list(found), device=device)
     return found
 
@@ -98,7 +96,8 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       light_stride: int,
                       normal: wp.array2d(dtype=float_pack),  # [3, P]
                       directions: wp.array(dtype=wp.vec3),  # [L]
-                      irradiance: wp.array(dtype=wp.vec3),  # [L] in stored units
+                      irradiance: wp.array(dtype=wp.vec3),  # [L]
+                      scale: wp.array(dtype=float),  # [L] radiance of a stored value of 1
                       # outputs
                       albedo: wp.array2d(dtype=float),  # [3, N]
                       squares: wp.array2d(dtype=float),  # [3, N]
@@ -123,12 +122,13 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
             if wp.static(near):
                 part = falloff[at]
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
+            unit = scale[light]  # a dark image, stored as a bright one, counts no more than others
             for k in range(pack):
                 facing = nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k]
                 cosine = wp.max(facing, 0.0)
                 slope = weight[k] * cosine
                 shadowed = wp.where(facing < BEHIND, 1.0, 0.0)
-                glow = float(red[k]) + float(green[k]) + float(blue[k])
+                glow = unit * (float(red[k]) + float(green[k]) + float(blue[k]))
                 behind[k] += wp.where(glow < LARGEST, shadowed * wp.max(glow, 0.0), 0.0)  # 0 also for NaN
                 if wp.static(near):
                     shadowed = shadowed * part[k]
@@ -142,9 +142,9 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                 sx[k] += slope * lx[step * k]
                 sy[k] += slope * ly[step * k]
                 sz[k] += slope * lz[step * k]
-                add_channel(float(red[k]), er, weight[k], cosine, above_r[k], below_r[k], squares_r[k])
-                add_channel(float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k], squares_g[k])
-                add_channel(float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k], squares_b[k])
+                add_channel(unit * float(red[k]), er, weight[k], cosine, above_r[k], below_r[k], squares_r[k])
+                add_channel(unit * float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k], squares_g[k])
+                add_channel(unit * float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k], squares_b[k])
         for k in range(pack):
             pixel = p * pack + k
             albedo[0, pixel] = albedo_of(above_r[k], below_r[k])

@@ -37,6 +37,19 @@ def test_the_scale_of_each_stored_image_is_undone(device):
     np.testing.assert_allclose(results[1][1], results[0][1], atol=1e-3)
 
 
+def test_a_dark_image_that_is_stored_as_a_bright_one_counts_no_more_than_others(device):
+    """A grazing light, whose reading is mostly bounced light, stored 64 times brighter: it shifts the albedo by what its reading is worth."""
+    direction = np.vstack([cap(15, 60), [[np.sqrt(1 - 0.01**2), 0, 0.01]]])
+    radiance = shade(np.array([[0.0, 0.0, 1.0]]), np.full((1, 3), 0.5), direction, np.ones((16, 3)))
+    radiance[:, -1] += 0.01
+    scale = np.array([1.0] * 15 + [1 / 64])
+    lights = pad_lights(direction, np.ones((16, 3)), scale)
+    band = packs.upload(store(radiance / scale[None, :, None]), device=device)
+    readings = grey_readings(band, grey_factors(lights, GREY))
+    found = fit_albedo(band, readings, solve_lambert(band, readings, lights.direction), lights)
+    np.testing.assert_allclose(found.albedo.numpy()[:, 0], 0.5, rtol=0.02)  # the normal turns by half a degree
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("lacks", [0, 2], ids=["no red", "no blue"])
 def test_a_value_that_is_not_finite_costs_its_light_alone(lacks, bad, device):
