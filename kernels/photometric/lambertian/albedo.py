@@ -3,7 +3,6 @@ follows from."""
 
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from kernels import device as devices
