@@ -38,7 +38,7 @@ def test_the_scale_of_each_stored_image_is_undone(device):
 
 
 def test_a_dark_image_that_is_stored_as_a_bright_one_counts_no_more_than_others(device):
-    """A grazing light, whose reading is mostly bounced light, stored 64 times brighter: it shifts the albedo by what its reading is worth."""
+    """The reading of a grazing light, mostly bounced, is stored 64 times brighter: it shifts the albedo by what it is worth."""
     direction = np.vstack([cap(15, 60), [[np.sqrt(1 - 0.01**2), 0, 0.01]]])
     radiance = shade(np.array([[0.0, 0.0, 1.0]]), np.full((1, 3), 0.5), direction, np.ones((16, 3)))
     radiance[:, -1] += 0.01
