@@ -89,7 +89,8 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2", "laspy", "pye57", "rawpy"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2", "gerbonara", "laspy", "pye57",
+               "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -106,7 +107,7 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),
     ("stupidArtnet", ["service.play.artnet_output"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
     ("laspy", ["stage.formats.las"]), ("pye57", ["stage.formats.e57"]),
-    ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
+    ("small_gicp", ["service.scans.points.neighbours"]), ("gerbonara", ["stage.formats.gerber"]), ("rawpy", ["stage.formats.camera_raw"]),
     ("fast_simplification", ["service.asset.content.levels_of_detail", "service.asset.content.uv_unwrap"]),
     ("xatlas", ["service.asset.content.uv_unwrap"]),
     ("MaterialX", ["service.asset.content.openpbr"]),
@@ -247,7 +248,7 @@ def test_no_cycles():
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
     heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib",
-             "fast_simplification", "laspy", "rawpy", "small_gicp", "xatlas")
+             "fast_simplification", "gerbonara", "laspy", "rawpy", "small_gicp", "xatlas")
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
             "try: service.cli.main.main()\n"

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 from kernels import device as devices
 from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
 from service.boards.height_files import BOARD_FILE, Match, Nominal, check_size, match, read_design, read_golden, write_board
-from service.boards.inspection_picture import PICTURE_FILE, write_picture
+from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
 from service.boards.stitching.form import bow_and_twist, fit_form, fit_spline
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
@@ -83,7 +83,7 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
     device = devices.resolve(request.device)
     nominal = _nominal(request)
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
-    stitched = _stitch(board, request, timings)
+    stitched = stitch_board(board, request.pixel_m, timings)
     if nominal is None:
         timings.stage("blend", len(board.tiles))
         heights, judged = _levelled(blend(board.tiles, stitched, stitched.grid, progress=timings.advance)), None
@@ -103,11 +103,12 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
         write_text(findings_path, findings_csv(judged.defects, judged.regions, areas))
     picture_path, report_path = request.out / PICTURE_FILE, request.out / REPORT_FILE
     write_picture(picture_path, heights, *((None, None, None, (), ()) if judged is None else (
-        judged.deviation, judged.inspected, judged.wanted, judged.defects, judged.regions)))
+        judged.deviation, judged.inspected, judged.wanted, judged.defects,
+        [Frame(each.region.centre_m, each.region.size_m, each.verdict) for each in judged.regions])))
     write_text(report_path, report(
         request,
         inputs={"board": str(request.board), "name": board.scan.name, "tiles": board.contents, **contents},
-        method=METHOD, stitching=_stitching(board, stitched), warnings=warnings, device=devices.describe(device),
+        method=METHOD, stitching=stitching_entries(board, stitched), warnings=warnings, device=devices.describe(device),
         height={"pixel_m": heights.grid.pixel_m, "resolution": [heights.grid.cols, heights.grid.rows],
                 "top_left_m": [heights.grid.left_m, heights.grid.top_m], "measured_pixels": int(heights.measured.sum()),
                 "sigma_m": statistics(heights.sigma[heights.measured])},
@@ -125,11 +126,12 @@ def _nominal(request: InspectBoardRequest) -> Nominal | None:
     return None if request.design is None else read_design(request.design)
 
 
-def _stitch(board: BoardTiles, request: InspectBoardRequest, timings: Timings) -> Stitched:
+def stitch_board(board: BoardTiles, pixel_m: float | None, timings: Timings) -> Stitched:
+    """Find where every tile of a board lies; `pixel_m` as in the request."""
     timings.stage("register", REGISTER_STEPS)
     try:
         found = stitch(board.tiles, shift_sigma_m=board.scan.stage_sigma_m, turn_sigma_degrees=board.scan.stage_sigma_degrees,
-                       pixel_m=request.pixel_m, progress=lambda share: timings.advance(int(share * REGISTER_STEPS)))
+                       pixel_m=pixel_m, progress=lambda share: timings.advance(int(share * REGISTER_STEPS)))
     except BoardError as error:
         raise BoardError(f"{board.path}: {error}") from error
     timings.advance(REGISTER_STEPS)
@@ -219,7 +221,8 @@ def _write_deviation(path: Path, judged: _Judged, provenance: dict[str, str]) ->
               color_space=exr.DATA, metadata=result_metadata(deviation.grid.camera(), provenance))
 
 
-def _stitching(board: BoardTiles, stitched: Stitched) -> dict[str, Any]:
+def stitching_entries(board: BoardTiles, stitched: Stitched) -> dict[str, Any]:
+    """Return where the tiles lie, and what their overlaps said, for a report."""
     motions, length = stitched.motions, stitched.length_m
     tiles = []
     for number, tile in enumerate(board.tiles):

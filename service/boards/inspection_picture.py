@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from service.boards.findings import Defect
 from service.boards.stitching.grid import BoardGrid, HeightMap
-from service.boards.stitching.regions import RegionResult, Verdict
+from service.boards.stitching.regions import Verdict
 from service.relight.sheet import fit, write_sheet
 
 PICTURE_FILE = "inspection.png"
@@ -21,11 +22,20 @@ SPAN_SIGMA = 6.0
 """The least deviation, in median σ, that has the full colour."""
 
 
+class Frame(NamedTuple):
+    """A rectangle of the board with a verdict."""
+
+    centre_m: tuple[float, float]
+    size_m: tuple[float, float]
+    verdict: Verdict | None
+    """None: nothing was judged."""
+
+
 def write_picture(path: Path, heights: HeightMap, deviation: HeightMap | None, inspected: np.ndarray | None, wanted: np.ndarray | None,
-                  defects: Sequence[Defect], regions: Sequence[RegionResult]) -> None:
+                  defects: Sequence[Defect], frames: Sequence[Frame]) -> None:
     """Write the panels as one PNG.
     `deviation`, `inspected`, `wanted`: of the comparison, [rows, cols]: the pixels that were inspected, and those that have a nominal
-    height. `defects`, `regions`: drawn as frames."""
+    height. `defects` and `frames` are drawn as frames."""
     low, high = np.percentile(heights.height[heights.measured], [1, 99])
     grey = np.clip((heights.height - low) / max(high - low, 1e-12), 0, 1)
     shown = np.where(heights.measured[..., None], grey[..., None] * np.ones(3), OUTSIDE)
@@ -33,8 +43,8 @@ def write_picture(path: Path, heights: HeightMap, deviation: HeightMap | None, i
     if deviation is not None and inspected is not None and wanted is not None:
         span = max([abs(defect.peak_m) for defect in defects] + [SPAN_SIGMA * float(np.median(deviation.sigma[deviation.measured]))])
         panels.append((f"deviation, {-1e6 * span:.3g} to {1e6 * span:.3g} µm", _signed(deviation.height / span, deviation.measured)))
-        panels.append((f"{len(defects)} defects; yellow: not inspected or undecided",
-                       _verdicts(deviation.grid, inspected, wanted, defects, regions)))
+        failed = len(defects) + sum(frame.verdict is Verdict.FAIL for frame in frames)
+        panels.append((f"{failed} fail; yellow: not inspected or undecided", _verdicts(deviation.grid, inspected, wanted, defects, frames)))
     write_sheet(path, [[(title, _reduced(np.nan_to_num(image).astype(np.float32))) for title, image in panels]], height=TILE_PX)
 
 
@@ -50,11 +60,11 @@ def _signed(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _verdicts(grid: BoardGrid, inspected: np.ndarray, wanted: np.ndarray, defects: Sequence[Defect],
-              regions: Sequence[RegionResult]) -> np.ndarray:
+              frames: Sequence[Frame]) -> np.ndarray:
     image = np.where(wanted[..., None], np.where(inspected[..., None], PASSED, OPEN), OUTSIDE)
-    for result in regions:
-        colour = {Verdict.FAIL: FAILED, Verdict.PASS: MIDDLE}.get(result.verdict, OPEN)
-        _frame(image, grid, result.region.centre_m, result.region.size_m, colour)
+    for frame in frames:
+        colour = {Verdict.FAIL: FAILED, Verdict.PASS: MIDDLE, None: MIDDLE}.get(frame.verdict, OPEN)
+        _frame(image, grid, frame.centre_m, frame.size_m, colour)
     for defect in defects:
         area = defect.area
         grown = area.width_m + 6 * grid.pixel_m, area.height_m + 6 * grid.pixel_m

@@ -34,7 +34,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "patterns": ("depth", "The images to project, and their manifest entries; or, with --plan, what each code costs."),
     "inspect-board": ("boards", "Stitch the tiles of a board to one height map, compare it with a golden map or a design, and "
                       "list what is wrong."),
+    "inspect-paste": ("boards", "Measure the solder paste on every pad of a board, and judge it by limits."),
     "gauge-board": ("boards", "Repeatability and reproducibility of inspections of the same boards (gauge R&R)."),
+    "board-capability": ("boards", "Capability of a print over several boards (Cp and Cpk of every pad), or of the heights of regions."),
     "register": ("scans", "Find the poses of scans of one object by their surfaces, and say how sure each is and which scans "
                  "could not be joined."),
     "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),

@@ -1,12 +1,12 @@
-"""The options of `relit inspect-board` and `relit gauge-board`."""
+"""The options of `relit inspect-board`, `inspect-paste`, `gauge-board` and `board-capability`."""
 
 from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from service.requests.base.base import Choice, DeviceRequest, Options, Role, Spelling
-from stage.model import Fraction, NotNegative, Positive
+from service.requests.base.base import Choice, Commas, DeviceRequest, Options, Role, Spelling
+from stage.model import Finite, Fraction, NotNegative, Positive
 
 
 class BoardForm(Choice):
@@ -83,3 +83,65 @@ class GaugeBoardRequest(Options):
     """The study: which result of relit inspect-board is of which board and operator (JSON, schema relit.gauge-study/1)."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for gauge.csv and report.json."""
+
+
+class BoardSide(Choice):
+    """The side of a board that was printed and measured."""
+
+    TOP = "top", "the layer as it is"
+    BOTTOM = "bottom", "the layer mirrored, as the board lies turned over about its y axis"
+
+
+class InspectPasteRequest(DeviceRequest):
+    """Measure the solder paste on every pad of a board, and judge it by limits."""
+
+    board: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="BOARD")]
+    """A folder with a board.json, or the file: the tiles, each a depth result or a capture."""
+    paste: Annotated[Path, Role.INPUT]
+    """The paste layer (Gerber): the openings of the stencil."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for board.exr, pads.csv, inspection.png and report.json."""
+    stencil_m: Positive
+    """Thickness of the stencil in metres."""
+    side: BoardSide = BoardSide.TOP
+    """The side of the board."""
+    origin_m: Annotated[tuple[Finite, Finite], Commas, Spelling(metavar="X,Y")] = (0.0, 0.0)
+    """Place in the layer, metres, that lies at the origin of the board frame."""
+    centroids: Annotated[Path | None, Role.INPUT] = None
+    """Centroid file (pick and place) that names the components, where the layer does not. None: pads are numbered."""
+    marks: Annotated[Path | None, Role.INPUT] = None
+    """Drill file (Excellon), or Gerber layer with fiducials, from which offsets count. None: from where most of the paste lies, so that an
+    offset of the whole print is not seen."""
+    limits: Annotated[Path | None, Role.INPUT] = None
+    """Limits of the pads (JSON, schema relit.paste-limits/1). None: pads are measured and not judged."""
+    limit_class: str | None = None
+    """Class of the limits. None: the only one of the file."""
+    area_level: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """Height above which paste belongs to its area, as a part of the stencil's thickness."""
+    bridge_level: Annotated[float, Field(gt=0, lt=1)] = 0.4
+    """Height above which paste connects pads, as a part of the stencil's thickness."""
+    pixel_m: Positive | None = None
+    """Side of a pixel of the height map in metres. None: the largest distance of neighbouring points of a tile."""
+    placement_m: Positive | None = None
+    """Standard deviation of the place of the board in its fixture along x and y, metres. None: 5 pixels."""
+    false_alarm: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    """Largest probability that any pad of a board within the limits fails."""
+    least_inspected: Fraction = 0.9
+    """Least part of a pad and its surroundings that must be measured; below, the pad is not inspected."""
+    cache: Annotated[Path | None, Role.MACHINE] = None
+    """Folder for the image stacks of captures; None: .relit in each capture's folder."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.limit_class is not None and self.limits is None:
+            raise ValueError("limit_class is given without limits: give the file of the limits with it")
+        return self
+
+
+class BoardCapabilityRequest(Options):
+    """Capability of a print over several boards (Cp and Cpk of every pad), or of the heights of regions."""
+
+    study: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="STUDY")]
+    """The study: results of relit inspect-paste or inspect-board, and which board each is of (JSON, schema relit.gauge-study/1)."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for capability.csv and report.json."""

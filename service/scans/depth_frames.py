@@ -4,6 +4,7 @@ A pixel at an edge of depth shows a mixture of both sides, which is no surface, 
 the square of the distance (Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12, 2012, equation 10: σ =
 .0014 z² for z in metres). What the calibration of the depth leaves is alike over parts of the image, and larger."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,10 @@ SIGMA_PER_M2 = 0.005
 """σ of a depth over the square of the depth, 1/m: between .004 and .006 the pairs of six real frames of a room are explained."""
 
 
-def write_frames(request: ScansImport, layout: FrameLayout) -> tuple[list[ScanEntry], list[tuple[str, str]]]:
+def write_frames(request: ScansImport, layout: FrameLayout, check: Callable[[int], object]
+                 ) -> tuple[list[ScanEntry], list[tuple[str, str]]]:
     """Write each frame as a folder with a depth.exr, and with the colours as points.ply, and return the scans and what was understood.
+    `check`: is called with the number of frames before any is written.
     Raises ManifestError: intrinsics are missing, or a pose or an image is wrong; names the file."""
     folder, unit_m = request.source, layout.unit_m if request.depth_unit_m is None else request.depth_unit_m
     if request.intrinsics_px is not None:
@@ -39,9 +42,16 @@ def write_frames(request: ScansImport, layout: FrameLayout) -> tuple[list[ScanEn
     else:
         raise ManifestError(f"{folder}: has depth images and no {INTRINSICS}: give --intrinsics FX,FY,CX,CY, of the first Kinect and its "
                             "like about 525,525,319.5,239.5")
+    frames = read_frames(folder, layout, request.poses)[:: request.every]
+    check(len(frames))
+    paths = (path for frame in frames for path in (frame.depth, frame.colour) if path is not None)
+    if missing := next((path for path in paths if not path.is_file()), None):
+        raise ManifestError(f"{missing}: is not there, and the lists of {folder} name it")
+    names = [frame.name for frame in frames]
+    if twice := next((name for at, name in enumerate(names) if name in names[:at]), None):
+        raise ManifestError(f"{folder}: two depth images are named {twice}: name them apart")
     entries, turned, dropped, total = [], 0.0, 0, 0
-    found = read_frames(folder, layout, request.poses)
-    for frame in found[:: request.every]:
+    for frame in frames:
         recorded = read_recorded(frame.depth)
         if recorded.dtype != np.uint16:
             raise ManifestError(f"{frame.depth}: is no image of 16 bits, as depths are")

@@ -2,6 +2,7 @@
 frames of a depth camera, or folders with results of relit depth."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +34,9 @@ USUAL_M = (0.01, 10.0)
 """The sizes that another unit would have to give it."""
 MIXED = 100.0
 """Scans of one object that differ so many times in size may be in different units."""
+FOR_POINTS = {"unit": "--unit", "viewpoint_m": "--viewpoint", "poses": "--poses"}
+FOR_FRAMES = {"poses": "--poses", "intrinsics_px": "--intrinsics", "every": "--every", "depth_unit_m": "--depth-unit-m"}
+"""The options that point files, and the frames of a depth camera, take beside those of a turntable; results of relit depth take none."""
 GREY = 128
 """The colour of points without one, of 255."""
 
@@ -44,6 +48,8 @@ class _Scan(NamedTuple):
     normals: np.ndarray | None
     viewpoint: np.ndarray | None  # [3] as its file says it
     pose: np.ndarray | None  # [4, 4] world from scan
+    converted: PointCloud | None = None
+    """What is written to `path`; None: it is a file of the source."""
 
 
 def import_scans(request: ScansImport) -> Imported:
@@ -65,16 +71,23 @@ def import_scans(request: ScansImport) -> Imported:
     if folder == source and (converted or (layout and not names)):
         raise ManifestError(f"{source}: {converted[0] if converted else 'depth images'} are converted: give another folder for the scans")
     if layout is not None and not names:
-        frames, said = write_frames(request, layout)
-        return _written(request, frames, said)
+        _refuse_unused(request, "depth images", FOR_FRAMES)
+        return _written(request, *write_frames(request, layout, partial(_angles, request)))
     if not names and (results := depth_results(source)):
+        _refuse_unused(request, "results of relit depth", {})
         return _written(request, _result_entries(request, results), [("scans", f"{len(results)} results of relit depth")])
     if not names:
         raise ManifestError(f"{source}: holds neither point files ({', '.join(POINT_FILES)}) nor images named *{DEPTH}, nor frames of "
                             f"TUM or Redwood, nor folders with a {DEPTH_FILE}")
+    _refuse_unused(request, "point files", FOR_POINTS)
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
+    _angles(request, len(scans))
+    for scan in scans:
+        if scan.converted is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_ply(scan.converted, folder / scan.path)
     placed = sum(scan.pose is not None for scan in scans)
     counts, sizes = [len(scan.points) for scan in scans], [float(np.ptp(scan.points, axis=0).max()) for scan in scans]
     facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
@@ -94,16 +107,29 @@ def import_scans(request: ScansImport) -> Imported:
     return _written(request, entries, facts)
 
 
+def _refuse_unused(request: ScansImport, what: str, taken: dict[str, str]) -> None:
+    """Refuse options that are given and that what the source holds does not take."""
+    if unused := [flag for name, flag in (FOR_POINTS | FOR_FRAMES).items()
+                  if name not in taken and getattr(request, name) != ScansImport.model_fields[name].default]:
+        raise ManifestError(f"{request.source}: holds {what}, which take no {' and no '.join(unused)}: leave it out")
+
+
+def _angles(request: ScansImport, count: int) -> tuple[float, ...] | None:
+    """Return the angles of a turntable at so many scans; None where they are not known."""
+    angles = request.turntable
+    if angles is not None and len(angles) == 1:
+        return tuple(0.0 + number * angles[0] for number in range(count))
+    if angles is not None and len(angles) != count:
+        raise ManifestError(f"{request.source}: has {count} scans, and --turntable {len(angles)} angles: give one for each, or one number, "
+                            "the step")
+    return angles
+
+
 def _written(request: ScansImport, entries: list[ScanEntry], facts: list[tuple[str, str]]) -> Imported:
     """Write the scan set with the turntable of the options."""
     path, table = request.folder / SCAN_SET_FILE, None
     if request.axis is not None and request.axis_point_m is not None:
-        angles = request.turntable
-        if angles is not None and len(angles) == 1:
-            angles = tuple(0.0 + number * angles[0] for number in range(len(entries)))
-        if angles is not None and len(angles) != len(entries):
-            raise ManifestError(f"{request.source}: has {len(entries)} scans, and --turntable {len(angles)} angles: give one for each, or "
-                                "one number, the step")
+        angles = _angles(request, len(entries))
         table = Turntable(axis_point_m=request.axis_point_m, axis=request.axis, angles_deg=angles)
         each = [f"{entry.name} {angle:g}" for entry, angle in zip(entries, angles or (), strict=angles is not None)]
         said = f"{', '.join(each)} degrees" if each else "its angles are not known"
@@ -123,7 +149,8 @@ def _result_entries(request: ScansImport, names: list[str]) -> list[ScanEntry]:
 
 
 def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) -> tuple[list[_Scan], np.ndarray | None]:
-    """Return the scans, of which those of other files than PLY are written, and the place in the files that becomes the origin, or None.
+    """Return the scans, of which those of other files than PLY are to be written, and the place in the files that becomes the origin, or
+    None.
 
     Coordinates on a map are too large for the floats of a PLY file.
     """
@@ -150,10 +177,9 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
             stems.add(unique)
             pose = None if part.pose is None else _in_metres(part.pose, unit)
             place = None if part.viewpoint is None else (part.viewpoint - shift) * unit
-            request.folder.mkdir(parents=True, exist_ok=True)
             grey = np.full(points.shape, GREY, np.uint8) if part.colours is None else part.colours
-            write_ply(PointCloud(points.astype(np.float32), grey, part.normals), request.folder / f"{unique}.ply")
-            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose))
+            converted = PointCloud(points.astype(np.float32), grey, part.normals)
+            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted))
     return found, moved
 
 

@@ -1,4 +1,5 @@
-"""relit inspect-board and gauge-board: what is wrong with a board, and how well inspections repeat."""
+"""relit inspect-board, inspect-paste, gauge-board and board-capability: what is wrong with a board, how well inspections repeat, and how
+well boards keep to their limits."""
 
 from typing import TYPE_CHECKING
 
@@ -6,11 +7,13 @@ import typer
 
 from service.cli.printing import print_warnings
 from service.cli.request_commands import product_command
-from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest
 
 if TYPE_CHECKING:
+    from service.boards.board_capability import BoardCapabilityResult
     from service.boards.gauge_board import GaugeBoardResult
     from service.boards.inspect_board import InspectBoardResult
+    from service.boards.inspect_paste import InspectPasteResult
 
 MOST_PRINTED = 10
 """Findings that are printed; the table has all."""
@@ -19,7 +22,9 @@ MOST_PRINTED = 10
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     product_command(app, "inspect-board", InspectBoardRequest, "service.boards.inspect_board:inspect_board", _inspect_board)
+    product_command(app, "inspect-paste", InspectPasteRequest, "service.boards.inspect_paste:inspect_paste", _inspect_paste)
     product_command(app, "gauge-board", GaugeBoardRequest, "service.boards.gauge_board:gauge_board", _gauge_board)
+    product_command(app, "board-capability", BoardCapabilityRequest, "service.boards.board_capability:board_capability", _board_capability)
 
 
 def _inspect_board(result: "InspectBoardResult") -> None:
@@ -44,6 +49,35 @@ def _inspect_board(result: "InspectBoardResult") -> None:
     print_warnings(result.warnings)
     if result.verdict not in (None, "pass"):
         raise typer.Exit(1)
+
+
+def _inspect_paste(result: "InspectPasteResult") -> None:
+    print(f"height   {result.board_path}")
+    print(f"picture  {result.picture_path}")
+    print(f"report   {result.report_path}")
+    print(f"pads     {result.pads_path}")
+    wrong = [each for each in result.pads if each.verdict not in (None, "pass") or each.bridged]
+    for each in wrong[:MOST_PRINTED]:
+        said = ", ".join(f"{name.removesuffix('_percent').replace('_', ' ')} {value:.1f} ± {sigma:.1f} %" for name, (value, sigma) in
+                         each.values.items())
+        connected = f", connected to {' '.join(each.bridged)}" if each.bridged else ""
+        print(f"pad      {each.name}: {each.verdict or 'not judged'}: {said or 'not measured'}{connected}")
+    if len(wrong) > MOST_PRINTED:
+        print(f"pads     {len(wrong) - MOST_PRINTED} more that did not pass are in the table")
+    print(f"verdict  {result.verdict or 'none, without limits'}, {len(result.pads)} pads")
+    print_warnings(result.warnings)
+    if result.verdict not in (None, "pass"):
+        raise typer.Exit(1)
+
+
+def _board_capability(result: "BoardCapabilityResult") -> None:
+    print(f"table    {result.table_path}")
+    print(f"report   {result.report_path}")
+    for each in result.found[:MOST_PRINTED]:
+        print(f"capable  {each.name} {each.quantity.replace('_', ' ')}: Cpk {each.cpk:.2f} (95 % sure: {each.cpk_bound:.2f}), "
+              f"Cp {each.cp:.2f}, {each.boards} boards")
+    if result.left_out:
+        print(f"left out {len(result.left_out)} that too few boards have or that do not vary: {', '.join(result.left_out[:5])}")
 
 
 def _gauge_board(result: "GaugeBoardResult") -> None:

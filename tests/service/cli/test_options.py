@@ -39,7 +39,7 @@ from service.requests.imports import patterns as pattern_images
 from service.requests.imports.interleaved import InterleavedImport
 from service.requests.imports.scans import ScansImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
-from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
@@ -48,7 +48,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
     "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
-    "gauge-board": [GaugeBoardRequest],
+    "gauge-board": [GaugeBoardRequest], "inspect-paste": [InspectPasteRequest], "board-capability": [BoardCapabilityRequest],
     "simulate cw": [SimulateCwRequest], "simulate pulsed": [SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
     "play": [play.PlayRequest], "capture": [acquire.AcquireRequest], "twin": [play.TwinRequest],
@@ -207,7 +207,8 @@ NO_JOBS = {
     "publish": "makes files for another web server", "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
     "blender-extension": "writes a file for another program of this machine",
-    "compare": "reads a design that is no capture",
+    "compare": "reads a design that is no capture", "inspect-paste": "reads a layer that is no capture",
+    "board-capability": "reads results of inspections that are no jobs",
     "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
     "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",

@@ -75,7 +75,18 @@ def test_frames_of_tum(relit, tmp_path, views):
     scans = json.loads((tmp_path / "one" / "scan-set.json").read_text())["scans"]
     assert ["scan_to_world" in entry for entry in scans] == [True, False]  # the second is 31 ms from any pose
     (folder / "groundtruth.txt").write_text("10.03 0 0 0 0 0 0 2\n")
-    assert "groundtruth.txt" in relit.refused("import", "scans", folder, tmp_path / "bad", "--intrinsics", "500,500,60,48")
+    given = ["--intrinsics", "500,500,60,48"]
+    assert "groundtruth.txt" in relit.refused("import", "scans", folder, tmp_path / "bad", *given)
+    (folder / "groundtruth.txt").unlink()
+    (folder / "depth.txt").write_text("10.030 depth/10.030.png\n10.064 depth/10.064.png\n10.1 depth/lost.png\n")
+    assert "depth/lost.png: is not there" in relit.refused("import", "scans", folder, tmp_path / "bad", *given)
+    (folder / "depth.txt").write_text("10.030 depth/10.030.png\n10.064 rgb/../depth/10.030.png\n")
+    assert "two depth images are named 10.030" in relit.refused("import", "scans", folder, tmp_path / "bad", *given)
+    (folder / "depth.txt").write_text("10.030 depth/10.030.png\n10.064 depth/10.064.png\n")
+    table = ["--axis", "0,1,0", "--axis-point", "0,0,0", "--turntable", "0,1,2"]
+    assert "2 scans, and --turntable 3 angles" in relit.refused("import", "scans", folder, tmp_path / "bad", *given, *table)
+    assert "take no --unit" in relit.refused("import", "scans", folder, tmp_path / "bad", *given, "--unit", "mm")
+    assert not (tmp_path / "bad").exists()
 
 
 def test_frames_of_redwood(relit, tmp_path, views):
@@ -152,6 +163,8 @@ def test_a_turntable_of_depth_results_is_written_by_options(relit, tmp_path, vie
     assert read_scan_set(tmp_path / "open")[1].turntable.angles_deg is None
     assert "3 angles" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "0,1,2", *table)
     assert "axis" in relit.refused("import", "scans", source, tmp_path / "bad", "--turntable", "40")
+    wrong = ["--unit", "mm", "--every", "2"]
+    assert "take no --unit and no --every" in relit.refused("import", "scans", source, tmp_path / "bad", *wrong)
 
 
 def test_a_list_without_depth_images_is_no_depth_camera(tmp_path):
