@@ -1,8 +1,7 @@
 """Kernels compiled for CUDA before they are launched: for a list of architectures into a folder, or those of a package side by side.
 
 Every kernel of kernels/ is found: those of modules, and those that a factory whose name ends with `_kernel` returns, for which the numbers
-that products give it stand in NUMBERS and its other arguments are told by their annotations; each value in turn beside the first of the
-others.
+`pack` or `lanes` is that of CUDA and its other arguments are told by their annotations; each value in turn beside the first of the others.
 """
 
 import importlib
@@ -20,16 +19,8 @@ import warp as wp
 import kernels
 from kernels import device as devices
 from kernels.errors import DeviceError
-from kernels.photometric.model.lobes import Lobes, Reflectance
-from kernels.photometric.model.response_table import SEARCH_LOBES, SEARCH_WIDTHS
-from kernels.photometric.model.samples import LANES_CUDA
-from kernels.photometric.posterior import sampling
-from kernels.photometric.search import survey
-from kernels.photometric.search.hypotheses import RingOptions
 
-NUMBERS = {"pack": [devices.PACK_CUDA], "lanes": [LANES_CUDA], "count": [2 + len(SEARCH_WIDTHS), SEARCH_LOBES],
-           "reweightings": [RingOptions.reweightings, survey.REWEIGHTINGS], "sweeps": [RingOptions.sweeps, sampling.OPTIONS.sweeps]}
-"""What a factory is given for arguments of these names."""
+WIDTHS = {"pack": devices.PACK_CUDA, "lanes": devices.LANES_CUDA}
 
 
 @cache
@@ -106,18 +97,18 @@ def _factories(module: Any) -> Iterator[tuple[str, Any]]:
 def _values_of(name: str, parameter: inspect.Parameter) -> list[Any]:
     """Return what an argument of a factory can be, its default first."""
     kind = parameter.annotation
-    if name in NUMBERS:
-        return NUMBERS[name]
+    if name in WIDTHS:
+        return [WIDTHS[name]]
     if kind is bool:
         values: list[Any] = [True, False]
     elif get_origin(kind) is Literal:
         values = list(get_args(kind))
     elif name == "dtype":
         values = [wp.float16, wp.uint8, wp.float32]
-    elif kind in (Lobes, Reflectance):
-        values = [make(**arguments) for module in modules() for _, make in _factories(module)
-                  if inspect.signature(make).return_annotation is kind for arguments in _variants(make)]
-    else:
+    else:  # what another factory makes
+        values = [made(**arguments) for module in modules() for _, made in _factories(module)
+                  if inspect.signature(made).return_annotation is kind for arguments in _variants(made)]
+    if not values:
         raise AssertionError(f"a kernel's factory takes {name}: {kind}, whose values are not known")
     if parameter.default is not parameter.empty:
         values.sort(key=lambda value: value != parameter.default)

@@ -29,6 +29,8 @@ PACK_CPU = 32
 """Pixels per thread on the CPU: wide enough for the compiler to fill SIMD registers (docs/figures.md)."""
 PACK_CUDA = 4
 """Pixels per thread on CUDA: one 8-byte load of half values per thread, coalesced over a warp."""
+LANES_CUDA = 1
+"""Pixels per thread on CUDA of kernels with dozens of sums for a pixel, which stay in registers; on the CPU a thread takes a whole pack."""
 UNEVEN_BLOCKS = 4
 """CPU blocks per core where some take longer than others. Where all take the same, one a core: starting a block takes a tenth of a
 millisecond of the interpreter, during which the other cores wait."""
