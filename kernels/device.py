@@ -29,6 +29,8 @@ PACK_CPU = 32
 """Pixels per thread on the CPU: wide enough for the compiler to fill SIMD registers (docs/figures.md)."""
 PACK_CUDA = 4
 """Pixels per thread on CUDA: one 8-byte load of half values per thread, coalesced over a warp."""
+LANES_CUDA = 1
+"""Pixels per thread on CUDA of kernels with dozens of sums for a pixel, which stay in registers; on the CPU a thread takes a whole pack."""
 UNEVEN_BLOCKS = 4
 """CPU blocks per core where some take longer than others. Where all take the same, one a core: starting a block takes a tenth of a
 millisecond of the interpreter, during which the other cores wait."""
@@ -48,6 +50,9 @@ MOST_BATCH_BYTES = 4 * 2**31
 
 CUDA_PIECES = 2
 """Pieces of an image that are in work on a CUDA device at one time."""
+
+MADE_AHEAD = Path(os.environ.get("RELIT_KERNELS") or Path(__file__).with_name("cubins"))
+"""Folder of the kernels that `relit kernels` compiled ahead, which may come with the package or be shared: it is only read."""
 
 EVERY = "all"
 """Stands for every CUDA device of the machine."""
@@ -247,7 +252,10 @@ def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
     if count > MAX_THREADS:
         raise ArrayError(f"the work is {count} threads, a launch has at most {MAX_THREADS}: cut it into smaller bands")
     with _build_lock:
-        kernel.module.load(device, block_dim=CPU_BLOCK if device == "cpu" else CUDA_BLOCK)
+        if device == "cpu":
+            kernel.module.load(device, block_dim=CPU_BLOCK)
+        else:
+            load_for_cuda(kernel, device)
     if device != "cpu":
         return Recorded([wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK,
                                    record_cmd=True)])
@@ -258,6 +266,25 @@ def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
     # recorded here, so that the pool's threads need the interpreter for a moment only
     return Recorded([wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu", record_cmd=True)
                      for first, last in itertools.pairwise(edges)])
+
+
+def cuda_module(kernel: Any) -> Any:
+    """Return the Warp module of a kernel, whose file is from now on named for launches on CUDA."""
+    wp.set_module_options({"block_dim": CUDA_BLOCK}, kernel.module)
+    return kernel.module
+
+
+@cache
+def load_for_cuda(kernel: Any, device: str) -> None:
+    """Load a kernel on a CUDA device from those made ahead or from Warp's cache; where neither has it, compile its package in parallel."""
+    for folder in (MADE_AHEAD, None):  # None: the cache
+        try:
+            return wp.load_aot_module(cuda_module(kernel), device, module_dir=folder, use_ptx=False)
+        except FileNotFoundError:
+            continue
+    from kernels import ahead  # knows all kernels, whose modules know this one
+
+    wp.force_load(device, ahead.package_of(kernel), block_dim=CUDA_BLOCK, max_workers=worker_count())
 
 
 def has_graphs(device: str) -> bool:

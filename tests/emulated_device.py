@@ -51,6 +51,8 @@ COUNTED = {"launches": "launches of kernels and of graphs", "graphed": "launches
 counts: Counter[str] = Counter()
 """What all threads have asked of the device so far, by the names of COUNTED."""
 counts_lock = RLock()
+loaded: set[str] = set()
+"""The names of the files of the kernels that were launched."""
 graph = local()
 """Has a true `now` in a thread while it does what CUDA does as one graph; the emulated device has no graphs."""
 
@@ -175,6 +177,11 @@ def load(module: Any, device: Any, block_dim: int | None = None, *args: Any, **o
     return plain_load(module, context.runtime.cpu_device if is_emulated else device, 1 if is_emulated else block_dim, *args, **options)
 
 
+def load_kernel(kernel: Any, device: str) -> None:
+    loaded.add(kernel.module.get_module_identifier(devices.CUDA_BLOCK))
+    load(kernel.module, device)
+
+
 def copy_array(dest: Any, src: Any, dest_offset: int = 0, src_offset: int = 0, count: int = 0, stream: Stream | None = None) -> None:
     if emulated not in (dest.device, src.device):
         plain_copy(dest, src, dest_offset, src_offset, count, stream)
@@ -234,6 +241,7 @@ def install() -> None:
     context.Device.total_memory = property(lambda device: MEMORY if device is emulated else plain_total_memory.fget(device))
     context.Device.free_memory = property(lambda device: memory.free if device is emulated else plain_free_memory.fget(device))
     context.Module.load = load
+    devices.load_for_cuda = load_kernel
     wp.array._init_from_data = from_data
     wp.launch = context.launch = launch
     wp.copy = context.copy = copy_array

@@ -154,8 +154,8 @@ def test_stage_and_kernels_meet_in_products_alone():
 
 
 def test_the_command_line_knows_kernels_and_warp_lightly():
-    """relit doctor runs a kernel, which is a check of the installation and no product, and --device asks which devices there are; they
-    may, when they are called."""
+    """relit doctor runs a kernel and relit kernels compiles them, which is the installation and no product, and --device asks which devices
+    there are; they may, when they are called."""
     knowing = {i for i in imports() if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
     assert {i.importer for i in knowing} <= {"service.cli.commands.doctor", "service.cli.request_commands"}

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.device_asked import asked_rows
+from kernels import ahead
+from kernels import device as devices
 from tests import emulated_device
 from tests.device_ways import SIDES, WAYS, Counting, count, read, results, run
 
@@ -42,6 +44,7 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
     """Lanes of a pack stop their iterations together, and packs differ in width: a value in a hundred may be off by 1e-3 of the largest."""
     captured = WAYS[way].write(tmp_path, SMALL)
     run(way, tmp_path, tmp_path / "cpu", "cpu", Counting())
+    emulated_device.loaded.clear()
     rows = count(way, SMALL, captured, tmp_path, tmp_path / "out", device)
     known, found = results(tmp_path / "cpu"), results(tmp_path / "out")
     assert known and known.keys() == found.keys()
@@ -50,6 +53,8 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
         assert np.mean(off > 1e-3 * np.abs(values).max()) <= 0.01, layer
     if device == emulated_device.NAME:
         compare(rows, way, SMALL)
+        made_ahead = {devices.cuda_module(make()).get_module_identifier() for make in ahead.every_kernel().values()}
+        assert emulated_device.loaded <= made_ahead  # as found for CUDA before a product asks
 
 
 @pytest.mark.parametrize("side", LARGE)

@@ -51,6 +51,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
                 "folder as it goes. Given again, the command takes the pictures that are missing."),
     "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "
                "and the service here."),
+    "kernels": ("doctor", "Compile all kernels for GPUs ahead, so that no machine compiles them when it first launches them; needs no "
+                "GPU."),
     "serve": ("server", "Run the service: the API, and a worker on each device."),
     "worker": ("server", "Run one more worker, on any machine that reaches the database and the storage."),
     "backup": ("server", "Save the database and the files of the service, which may run meanwhile, with their checksums."),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import ahead
 from kernels import device as devices
 from kernels.errors import ArrayError, DeviceError
 
@@ -113,6 +114,51 @@ def test_a_driver_that_is_too_old_is_said(driver, outdated, monkeypatch):
     with pytest.raises(DeviceError) as refused:
         devices.resolve("cuda:99")
     assert ("supports CUDA 12.9, and Warp needs CUDA 13.0" in str(refused.value)) == outdated
+
+
+def test_a_kernel_is_loaded_from_those_made_ahead(tmp_path):
+    """Of a file that Warp compiled ahead for the CPU, named for CUDA's blocks, as CUDA would load a cubin: another process finds it
+    by its name and compiles nothing."""
+    code = f"""
+import sys
+import warp as wp
+from kernels import ahead, device
+device.names()
+kernel = ahead.every_kernel()["surface.nearest._nearest"]()
+if sys.argv[1:]:
+    wp.compile_aot_module(device.cuda_module(kernel), "cpu", module_dir={str(tmp_path / "made")!r})
+else:
+    device.load_for_cuda(kernel, "cpu")
+"""
+    for number, given in enumerate((["make"], [])):
+        environment = os.environ | {"RELIT_KERNELS": str(tmp_path / "made"), "WARP_CACHE_PATH": str(tmp_path / f"cache {number}")}
+        subprocess.run([sys.executable, "-c", code, *given], cwd=Path(devices.__file__).parents[1], check=True, env=environment)
+    assert [path.name for path in (tmp_path / "made").glob("*.o")]
+    assert not [path for path in (tmp_path / "cache 1").rglob("*") if path.is_file()]
+
+
+def test_kernels_that_nobody_made_are_compiled_with_their_package_side_by_side(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(devices, "MADE_AHEAD", tmp_path)
+    monkeypatch.setattr(wp, "load_aot_module", lambda module, device, module_dir, use_ptx: asked.append(module_dir) or missing())
+    monkeypatch.setattr(wp, "force_load", lambda device, modules, **options: asked.append((device, modules, options)))
+
+    def missing():
+        raise FileNotFoundError
+
+    smooth = ahead.every_kernel()["surface.multigrid._smooth_from_zero"]()
+    devices.load_for_cuda.__wrapped__(smooth, "cuda:0")
+    *looked, (device, modules, options) = asked
+    assert looked == [tmp_path, None] and device == "cuda:0"
+    assert options == {"block_dim": devices.CUDA_BLOCK, "max_workers": devices.worker_count()}
+    package = {make().module for name, make in ahead.every_kernel().items() if name.startswith("surface.")}
+    assert modules[0] is smooth.module and len(modules) == len(package) and set(modules) == package
+
+
+def test_an_architecture_that_nobody_compiles_for_is_refused(tmp_path):
+    with pytest.raises(DeviceError, match="architecture 12 is not one that Warp"):
+        ahead.build(tmp_path / "made", [12])
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.long

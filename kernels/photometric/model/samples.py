@@ -12,9 +12,6 @@ from kernels.packs import Band, as_pixels, pack_type
 from kernels.photometric.lambertian.near import NearField, falloff, near_direction
 from kernels.photometric.lambertian.readings import LARGEST, Lights
 
-LANES_CUDA = 1
-"""Number of pixels of one thread on CUDA, which keeps the dozens of sums of a pixel in registers. On the CPU a thread takes a whole
-pack."""
 SHADOW_FRACTION = 0.1
 """Fraction of the level of all readings below which a reading counts as shadow and is left out of the pixel's level."""
 
@@ -117,7 +114,7 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
         raise ArrayError(f"points are {field.points.shape} under {len(field.places.place)} padded lights, expected "
                          f"{(3, len(pixels))} under {len(lights.direction)}")
     device = band.device
-    lanes = devices.pack_width(device) if device == "cpu" else LANES_CUDA
+    lanes = devices.pack_width(device) if device == "cpu" else devices.LANES_CUDA
     packs = -(-len(pixels) // lanes)
     last = len(pixels) - 1
     order = np.minimum(np.arange(packs * lanes), last)

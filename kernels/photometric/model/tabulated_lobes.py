@@ -6,13 +6,24 @@ any lobe.
 """
 
 import math
+from typing import Literal
 
 import warp as wp
 
 from kernels.device import once
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.lobes import Lobes, Reflectance
-from kernels.photometric.model.response_table import GRID, LEAST_NZ, MIRROR_ALPHA, NARROWEST, WIDTH_COUNT, WIDTH_RATIO, grid_position
+from kernels.photometric.model.response_table import (
+    GRID,
+    LEAST_NZ,
+    MIRROR_ALPHA,
+    NARROWEST,
+    SEARCH_LOBES,
+    SEARCH_WIDTHS,
+    WIDTH_COUNT,
+    WIDTH_RATIO,
+    grid_position,
+)
 from kernels.photometric.model.samples import samples_type, scratch_type
 
 RELAXATION = 1.6
@@ -51,7 +62,7 @@ def width_position(roughness: float) -> float:
 
 
 @once
-def tabulated_lobes(lanes: int, count: int) -> Lobes:
+def tabulated_lobes(lanes: int, count: Literal[2 + len(SEARCH_WIDTHS), SEARCH_LOBES]) -> Lobes:
     """Return the mixture of a search table of `count` lobes."""
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     pairs = wp.types.matrix(shape=(4, lanes), dtype=wp.float32)

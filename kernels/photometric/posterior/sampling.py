@@ -25,10 +25,11 @@ from kernels.photometric.model.samples import Samples
 from kernels.photometric.posterior.modes import Modes, find_modes, weigh
 from kernels.photometric.posterior.posterior import Group, bounded, measure_noise, normal_posterior
 from kernels.photometric.search.hypotheses import Diffuse, RingOptions, search_normals
+from kernels.photometric.search.search_kernel import SAMPLING_SWEEPS
 
 DIELECTRIC, METAL = 0.04, 0.8
 """F0 of the two kinds of lobes. Their Fresnel rises differ, and over a wide light this moves the estimated normal by degrees."""
-OPTIONS = RingOptions(noise_floor=0.05, noise_slope=0.05, sweeps=30)
+OPTIONS = RingOptions(noise_floor=0.05, noise_slope=0.05, sweeps=SAMPLING_SWEEPS)
 """Search options for wide lights. They cause no isolated highlights, so that a dim reading has less unexplained light than under single
 lamps; for bright readings the table is accurate to a few per cent."""
 AROUND, AROUND_OPTIONS = (((2.0, 4.0, 6.0), 16), ((1.0, 2.0), 8)), replace(

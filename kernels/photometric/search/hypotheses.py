@@ -27,7 +27,7 @@ from kernels.photometric.model.lobes import direction_lobes
 from kernels.photometric.model.robust_weights import Criteria
 from kernels.photometric.model.samples import Samples, host_values, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 from kernels.photometric.model.tabulated_lobes import tabulated_lobes
-from kernels.photometric.search.search_kernel import search_kernel, search_type
+from kernels.photometric.search.search_kernel import REWEIGHTINGS, SWEEPS, search_kernel, search_type
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +58,13 @@ class SearchOptions:
 class RingOptions(SearchOptions):
     """Options for the scores of candidates on rings, and for the fit of the mixture of each."""
 
-    reweightings: int = 5
-    """Rounds of the robust fit; with three, normals are 0.1° worse on real data."""
-    sweeps: int = 12
+    reweightings: int = REWEIGHTINGS
+    """Rounds of the robust fit."""
+    sweeps: int = SWEEPS
     """Coordinate sweeps of each non-negative solve."""
 
     @classmethod
-    def of(cls, options: SearchOptions, *, reweightings: int = 5) -> "RingOptions":
+    def of(cls, options: SearchOptions, *, reweightings: int = REWEIGHTINGS) -> "RingOptions":
         """Return options that judge alike, with a number of rounds of the robust fit."""
         return cls(noise_floor=options.noise_floor, noise_slope=options.noise_slope, shadow_cost=options.shadow_cost,
                    shadow_depth=options.shadow_depth, reweightings=reweightings)

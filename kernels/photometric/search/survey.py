@@ -18,6 +18,7 @@ from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, samples_type, to_host
 from kernels.photometric.search.descent import Descent, Schedule, descend
 from kernels.photometric.search.hypotheses import Diffuse, Prior, RingOptions, SearchOptions, search_normals
+from kernels.photometric.search.search_kernel import SURVEY_REWEIGHTINGS
 
 INFORMATIVE = 0.1
 """Part of a pixel's level below which a reading is shadow and says little: it does not count as information."""
@@ -79,8 +80,6 @@ def _count_kernel(lanes: int) -> Any:
     return count_kernel
 
 
-REWEIGHTINGS = 2
-"""Rounds of the robust fit of each candidate: it shows the mode, and the descent from the best candidate the cost of its bottom."""
 AGAIN = Schedule(softened=2, judged=6, softness=4.0, cooling=0.25)
 """Descent from the best candidate."""
 SPARE = 24
@@ -125,7 +124,7 @@ def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchO
         return None
     chosen, middle = choose(samples, pixels), found.normal[pixels]
     drawn = None if prior is None else prior._replace(normal=prior.normal[pixels])
-    rounds = RingOptions.of(options or SearchOptions(), reweightings=REWEIGHTINGS)
+    rounds = RingOptions.of(options or SearchOptions(), reweightings=SURVEY_REWEIGHTINGS)
     ringed = search_normals(chosen, middle, shape=shape, options=rounds, wide=sweep.rings, prior=drawn)
     found.replace(pixels, descend(chosen, ringed.normal, shape=shape, options=options, weights=ringed.weights, prior=drawn,
                                   schedule=AGAIN))

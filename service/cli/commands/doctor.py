@@ -1,4 +1,4 @@
-"""relit doctor: check this installation."""
+"""relit doctor: check this installation; relit kernels: compile its kernels ahead."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,13 +8,16 @@ import typer
 from service.cli.commands.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
+ARCHITECTURES = 86, 89, 90
+"""GPUs for which kernels are compiled ahead without --arch: Ampere's and Ada's of workstations, and Hopper."""
 
 DoctorDevice = Annotated[str | None, typer.Option("--device", help="Check only this device; without it all.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     app.command("doctor")(doctor)
+    app.command("kernels")(kernels)
 
 
 def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOption = None) -> None:
@@ -66,6 +69,24 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
     print("sound" if not faults else f"{len(faults)} faults")
     if faults:
         raise typer.Exit(1)
+
+
+def kernels(
+    out: Annotated[Path | None, typer.Argument(help="Folder for the kernels, which RELIT_KERNELS then names; without it that of this "
+                                               "installation.", show_default=False)] = None,
+    arch: Annotated[list[int], typer.Option(help="Architecture of GPUs, 89 for compute capability 8.9; may be given several times.")
+                    ] = list(ARCHITECTURES),  # noqa: B006
+) -> None:
+    """Compile all kernels for GPUs ahead, so that no machine compiles them when it first launches them; needs no GPU.
+
+    An installation finds those in its own folder, and those in the folder that the environment variable RELIT_KERNELS names.
+    """
+    from kernels import ahead, device
+
+    folder = out or device.MADE_AHEAD
+    made = ahead.build(folder, arch)
+    print(f"{folder}: {len(made)} kernels for {', '.join(f'sm_{each}' for each in dict.fromkeys(arch))}, "
+          f"{sum(path.stat().st_size for path in made) / 1e6:.1f} MB")
 
 
 def _wrong_products(device: str) -> list[str]:

@@ -26,7 +26,7 @@ from stage.model import Count, Positive
 
 PREFIX = "RELIT_"
 CONFIG = "RELIT_CONFIG"
-OTHERS = (CONFIG, "RELIT_SERVER", "RELIT_KEY")
+OTHERS = (CONFIG, "RELIT_SERVER", "RELIT_KEY", "RELIT_KERNELS")
 """Variables of the program that are not settings of the service."""
 TESTS = "RELIT_TEST_"
 NO_WORKER = "none"

@@ -22,7 +22,7 @@ from stage.capture.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
 SHOWN = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
-         "basis", "view", "export", "inspect", "doctor", "bench", "serve", "worker", "keys"]
+         "basis", "view", "export", "inspect", "doctor", "kernels", "bench", "serve", "worker", "keys"]
 ROOT = Path(service.__file__).parents[1]
 
 
