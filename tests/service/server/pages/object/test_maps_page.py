@@ -14,7 +14,8 @@ pytestmark = pytest.mark.long
 
 DRAWN = """(canvas) => {
   const pen = canvas.getContext("2d");
-  return [-20, 20].every((x) => pen.getImageData(canvas.width / 2 + x, canvas.height / 2, 1, 1).data[3] === 255) ? canvas.toDataURL() : null;
+  const isOpaque = (x) => pen.getImageData(canvas.width / 2 + x, canvas.height / 2, 1, 1).data[3] === 255;
+  return isOpaque(-20) && isOpaque(20) ? canvas.toDataURL() : null;
 }"""
 """The picture of the map, or null as long as nothing is drawn beside its middle."""
 
@@ -49,7 +50,8 @@ def point_at(page, row: int, col: int, side: int) -> str:
 
 def drawn(page, *others: str) -> str:
     """What the map shows, when its tile has come and it is none of these pictures."""
-    return seen(page, lambda: (found := page.locator("canvas.map").evaluate(DRAWN)) not in (None, *others) and found, "the map is not drawn")
+    canvas = page.locator("canvas.map")
+    return seen(page, lambda: (found := canvas.evaluate(DRAWN)) not in (None, *others) and found, "the map is not drawn")
 
 
 def numbers(said: str, title: str) -> list[float]:
