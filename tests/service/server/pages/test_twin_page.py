@@ -51,7 +51,7 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         player.join()
         page.locator("#dome title", has_text=f"lamp {brightest}: 0.0 %, 0.0 %, 0.0 %").wait_for(state="attached")
         program.send_signal(signal.SIGINT)
-        assert program.wait(timeout=20) == 0
+        assert program.wait(timeout=120) == 0
         page.locator("#state", has_text="The twin has ended.").wait_for()
         context.close()
         assert errors == []
