@@ -188,11 +188,13 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
     card = page.locator(f"[data-id={solved.capture}]")
     await_picture(page, solved.capture)
     light = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 4 === 0)"
-    seen, pictures = {}, [card.locator("canvas").evaluate(light)]
+    sums, pictures = {}, [card.locator("canvas").evaluate(light)]
 
     def lit_from(x: float) -> list[int] | None:
         """The picture under the pointer, when it is another one than before; the wall may move, and make the card anew, meanwhile."""
         box = card.locator(".shown").bounding_box()
+        if box is None:
+            return None
         page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.4 * box["height"])
         page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
         red = card.locator("canvas").evaluate(light)
@@ -202,8 +204,8 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
         red = seen(page, lambda x=x: lit_from(x))
         pictures.append(red)
         width = round(len(red) ** 0.5)
-        seen[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
-    assert seen["left"][0] > seen["right"][0] and seen["left"][1] < seen["right"][1]
+        sums[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
+    assert sums["left"][0] > sums["right"][0] and sums["left"][1] < sums["right"][1]
     await_picture(page, sky)
     card.get_by_role("link").press("Enter")
     page.wait_for_url(re.compile(f"/{solved.capture}$"))

@@ -50,7 +50,7 @@ def test_a_worker_is_drained_and_killed_and_another_takes_its_place(browser, tmp
             button = page.get_by_role("button", name=f"{what} cpu, process")
             button.first.wait_for()
             before = button.first.get_attribute("aria-label")
-            button.first.click()
+            page.get_by_role("button", name=before, exact=True).click()
             page.wait_for_function("([what, before]) => [...document.querySelectorAll('#workers button')].some((each) => !each.disabled"
                                    " && each.textContent === what && each.getAttribute('aria-label') !== before)", arg=[what, before])
             page.wait_for_function("(before) => [...document.querySelectorAll('#workers button')]"

@@ -121,9 +121,13 @@ def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl,
     page.wait_for_function("document.querySelector('#embed textarea').value !== ''")  # it is written when the browser says that it is open
     code = page.locator("#embed textarea").input_value()
     bar = page.locator("#scale")
-    length = {"4 cm": 40, "5 cm": 50, "2 cm": 20, "1 cm": 10}[bar.inner_text()]
-    zoom = page.evaluate("document.getElementById('stage').getBoundingClientRect().height") / 320  # the whole height is shown
-    assert bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
+
+    def is_true() -> bool:
+        length = {"4 cm": 40, "5 cm": 50, "2 cm": 20, "1 cm": 10}[bar.inner_text()]
+        zoom = page.evaluate("document.getElementById('stage').getBoundingClientRect().height") / 320  # the whole height is shown
+        return bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
+
+    seen(page, is_true, "the scale bar is wrong")
     page.locator("#full").click()
     page.wait_for_function("document.fullscreenElement?.id === 'stage'")
     page.keyboard.press("Escape")
