@@ -25,6 +25,13 @@ export function byId(id) {
   return found;
 }
 
+/** Let an element have these children; those that it has already stay where they are, and with them the focus and a click that has begun. */
+export function setChildren(parent, children) {
+  const wanted = new Set(children);
+  for (const child of [...parent.childNodes]) if (!wanted.has(child)) child.remove();
+  children.forEach((child, at) => { if (parent.childNodes[at] !== child) parent.insertBefore(child, parent.childNodes[at] ?? null); });
+}
+
 /** Show or hide an element. */
 export function show(target, visible) {
   target.hidden = !visible;

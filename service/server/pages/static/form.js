@@ -11,7 +11,9 @@ import { element } from "./element.js";
 export function enableForms(root, subject) {
   for (const form of root.querySelectorAll("form[data-kind]")) {
     const details = form.closest("details");
-    details.addEventListener("toggle", () => details.open && attempt(() => open(form, subject)), { once: true });
+    enter(form, subject);
+    if (details.open) attempt(() => fillLists(form));
+    else details.addEventListener("toggle", () => attempt(() => fillLists(form)), { once: true });
     form.addEventListener("input", () => present(form));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -43,16 +45,25 @@ export function curlOf(request) {
   return `curl -sS ${location.origin}/v1/jobs${key} -H 'Content-Type: application/json' -d ${quoted(JSON.stringify(request))}`;
 }
 
-async function open(form, subject) {
-  for (const select of form.querySelectorAll("select[data-lists]")) {
-    await fill(select);
-    if (select.closest(".field").hasAttribute("data-argument")) {
-      if (![...select.options].some((option) => option.value === subject)) select.append(element("option", { value: subject }, subject));
-      select.value = subject;
-    }
+/** Enter what the page is about, before anything is listed: a person may submit at once, and what is chosen while lists come stays. */
+function enter(form, subject) {
+  for (const control of form.querySelectorAll(".field[data-argument] :is(select, textarea)[data-lists]")) {
+    if (subject !== "" && control.localName === "select") control.append(element("option", { value: subject }, subject));
+    control.value ||= subject;
   }
-  for (const area of form.querySelectorAll(".field[data-argument] textarea[data-lists]")) area.value ||= subject;
   present(form);
+}
+
+async function fillLists(form) {
+  for (const select of form.querySelectorAll("select[data-lists]")) await fill(select);
+}
+
+/** Add what can be chosen, by its name and identifier; what the page is about is there already, and gets its name. */
+function put(select, value, name) {
+  const words = `${name} · ${value}`;
+  const before = [...select.options].find((option) => option.value === value);
+  if (before === undefined) select.append(element("option", { value }, words));
+  else before.textContent = words;
 }
 
 async function fill(select) {
@@ -60,13 +71,13 @@ async function fill(select) {
   if (kind === "job") {
     for await (const job of listing("/v1/jobs?state=succeeded", "jobs")) {
       if (["solve", "pipeline", "depth", "join", "register"].includes(job.request.kind)) {
-        select.append(element("option", { value: job.id }, `${job.request.name || job.request.kind} · ${job.id}`));
+        put(select, job.id, job.request.name || job.request.kind);
       }
     }
     return;
   }
   for await (const item of listing(`/v1/${kind}s`, "items")) {
-    if (item.state === "ready") select.append(element("option", { value: item.id }, `${item.name} · ${item.id}`));
+    if (item.state === "ready") put(select, item.id, item.name);
   }
 }
 

@@ -45,15 +45,12 @@ export class JobsTable {
       element("td", {}, ...bar(job), progressOf(job)),
       element("td", {}, time(job.created_at)));
     const before = this.#rows.get(job.id);
-    if (before === undefined) {
-      const older = [...this.#body.rows].find((other) => other.dataset.created < job.created_at);
-      this.#body.insertBefore(row, older ?? null);
-    } else if (before.contains(document.activeElement)) {
-      before.replaceWith(row);
-      row.querySelector("a").focus();
-    } else {
-      before.replaceWith(row);
+    if (before !== undefined) { // its link stays, and with it the focus and a click that has begun
+      [...row.cells].forEach((cell, at) => at > 0 && before.cells[at].replaceWith(cell));
+      return;
     }
+    const older = [...this.#body.rows].find((other) => other.dataset.created < job.created_at);
+    this.#body.insertBefore(row, older ?? null);
     this.#rows.set(job.id, row);
   }
 

@@ -15,6 +15,7 @@ from PIL import Image
 from benchmarks.clients import installed
 from tests.service.server.api.job_calls import admitted, finish, submit
 from tests.service.server_process import Server, serving
+from tests.service.waiting import until
 
 SAMPLES = Path(__file__).resolve().parents[4] / "samples"
 REQUIRED = os.environ.get("RELIT_TEST_PAGES") == "required"
@@ -54,6 +55,24 @@ def browser():
         running = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
         yield running
         running.close()
+
+
+def expect(found):
+    """Playwright's assertions on a locator or a page, which wait for what they say; loaded when a test needs them."""
+    from playwright.sync_api import expect as waiting
+
+    waiting.set_options(timeout=PATIENCE_MS)
+    return waiting(found)
+
+
+def seen(page, look, what: str = "the page does not show it"):
+    """Look at a page again and again until there is something, and return it; the page's requests are answered meanwhile."""
+    return until(lambda: look() or page.wait_for_timeout(20), what, within_s=PATIENCE_MS / 1000)
+
+
+def await_whole(page) -> None:
+    """Wait until nothing of a page is invisible any more because something of it still loads."""
+    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
 
 
 def spread_fingers(canvas) -> None:
@@ -127,11 +146,12 @@ class Solved:
             self.pages |= {"job": f"/jobs/{solve}", "maps": f"/maps/{solve}"}
 
     def wait_for_content(self, page, name: str) -> None:
-        """Wait until a page shows what it is for."""
+        """Wait until a page shows what it is for, and all else of it."""
         content = {"home": ".card canvas", "machines": "#audit tbody tr", "captures": "#captures a", "jobs": "#jobs tbody tr",
                    "capture": "#frames canvas", "job": "#stages tbody tr",
                    "light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map"}[name]
         page.locator(content).first.wait_for(timeout=CONTENT_MS)
+        await_whole(page)
 
     def result(self, job: str, name: str, folder: Path) -> Path:
         """Download a result."""

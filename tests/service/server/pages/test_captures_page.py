@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from tests.service.server.pages.conftest import CONTENT_MS, SAMPLES
+from tests.service.server.pages.conftest import CONTENT_MS, SAMPLES, await_whole, expect
 
 pytestmark = pytest.mark.long
 
@@ -40,7 +40,7 @@ def test_a_folder_is_uploaded_whole_but_for_hidden_files(server, page, folder):
     assert found["state"] == "ready"
     assert {file["path"]: file["sha256"] for file in found["files"]} == local
     page.locator("#facts").get_by_text("Identifier", exact=True).wait_for()
-    assert "128 × 128" in page.locator("#facts").inner_text()
+    expect(page.locator("#facts")).to_contain_text("128 × 128")
 
 
 def test_an_upload_goes_on_after_broken_requests(server, page, folder):
@@ -89,9 +89,8 @@ def test_a_manifest_that_is_broken_is_named(page, folder):
     (folder / "capture.json").write_text(json.dumps(manifest))
     page.goto("/captures")
     page.set_input_files("#folder", folder)
-    fault = page.locator("#uploads .fault")
-    fault.wait_for(timeout=UPLOAD_MS)
-    assert all(words in fault.inner_text() for words in ("frames", "direction"))
+    for words in ("frames", "direction"):
+        expect(page.locator("#uploads .fault")).to_contain_text(words, timeout=UPLOAD_MS)
 
 
 def test_an_environment_is_uploaded(server, page, tmp_path):
@@ -117,14 +116,14 @@ def test_a_folder_without_images_is_refused_and_its_name_is_text(page, tmp_path)
 def test_what_a_capture_lacks_leads_to_the_form_that_measures_it(page, solved):
     page.goto(solved.pages["capture"])
     solved.wait_for_content(page, "capture")
-    page.locator("[data-calibration=dark]").wait_for()
-    found = {each.get_attribute("data-calibration"): each.get_attribute("class") for each in page.locator("[data-calibration]").all()}
-    assert found == {"dark": "missing", "flat": "missing", "lights": "there", "colours": "missing"}
-    assert page.locator("[data-calibration=lights] button").count() == 0
+    expect(page.locator("[data-calibration]")).to_have_count(4)
+    for name, state in {"dark": "missing", "flat": "missing", "lights": "there", "colours": "missing"}.items():
+        expect(page.locator(f"[data-calibration={name}]")).to_have_class(state)
+    expect(page.locator("[data-calibration=lights] button")).to_have_count(0)
     page.locator("[data-calibration=dark]").get_by_role("button", name="Calibrate the dark frame").click()
     form = page.locator("form[data-kind=calibrate-dark]")
     form.get_by_role("button", name="Submit").wait_for()
-    assert form.evaluate("(each) => each.contains(document.activeElement)")
+    expect(form.locator(":focus")).to_have_count(1)
 
 
 def test_a_preview_shows_the_middle_quarter_and_is_no_result_of_the_object(page, solved):
@@ -142,6 +141,7 @@ def test_a_preview_shows_the_middle_quarter_and_is_no_result_of_the_object(page,
     assert preview["request"]["options"]["crop"][:2] == [width // 4, height // 4]
     page.goto(f"{solved.pages['object']}#mode=maps")
     page.locator("canvas.map").wait_for()
-    assert "Preview of the middle" not in page.locator("main").inner_text()
     page.locator("#files a", has_text="maps.exr").wait_for()
-    assert page.locator("#modes button", has_text="Maps").count() == 1
+    await_whole(page)
+    expect(page.locator("main")).not_to_contain_text("Preview of the middle")
+    expect(page.locator("#modes button", has_text="Maps")).to_have_count(1)

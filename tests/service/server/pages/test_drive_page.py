@@ -7,7 +7,7 @@ import pytest
 from stage.transforms import fibonacci_sphere
 from tests.scenes.rigs import write_rig
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, done, new_context
+from tests.service.server.pages.conftest import PICTURES, done, expect, new_context, seen
 
 pytestmark = pytest.mark.long
 
@@ -40,10 +40,8 @@ def test_the_lamps_of_each_frame_and_the_files(page, server, driven, tmp_path):
         wanted: dict[str, list[float]] = {}
         for (lamp, _), level in zip(cues.json()["emitters"], frame["levels"], strict=True):
             wanted.setdefault(lamp, []).append(100 * level)
-        found = shown(page)
-        assert found.keys() == wanted.keys()
-        assert all(found[lamp] == pytest.approx(wanted[lamp], abs=0.0501) for lamp in wanted)  # one decimal is shown
-        fills.append([dot.get_attribute("fill") for dot in page.locator("#dome circle[fill]").all()])
+        assert shown(page) == {lamp: pytest.approx(levels, abs=0.0501) for lamp, levels in wanted.items()}  # one decimal is shown
+        fills.append(page.locator("#dome circle[fill]").evaluate_all("all => all.map((each) => each.getAttribute('fill'))"))
     assert len({tuple(each) for each in fills}) == 4
     assert any("255" in fill for each in fills for fill in each)  # the brightest of all frames
     page.wait_for_function("document.getElementById('picture').naturalWidth > 0")
@@ -58,12 +56,14 @@ def test_balls_the_environment_and_the_object_follow_the_slider(page, driven, so
     page.get_by_label("Object", exact=True).select_option(solved.capture)
     page.locator("#picture-of-object canvas[data-ready]").wait_for(timeout=120_000)
     canvases = page.locator("#environment canvas, #balls canvas, #picture-of-object canvas")
-    assert canvases.count() == 4
-    shown = []
-    for place in ("0", "2"):
+    expect(canvases).to_have_count(4)
+
+    def pictures(place: str) -> list[str]:
         page.get_by_label("Frame").fill(place)
-        shown.append(canvases.evaluate_all("found => found.map((canvas) => canvas.toDataURL())"))
-    assert all(one != other for one, other in zip(*shown, strict=True))
+        return canvases.evaluate_all("found => found.map((canvas) => canvas.toDataURL())")
+
+    first = pictures("0")
+    seen(page, lambda: all(one != other for one, other in zip(first, pictures("2"), strict=True)))
 
 
 def test_a_job_of_another_kind_is_said(page, solved):

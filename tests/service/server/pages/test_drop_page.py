@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from tests.scenes.foreign import write_four_phases
+from tests.service.server.pages.conftest import expect
 from tests.service.server.pages.photographs import write_photographs
 
 pytestmark = pytest.mark.long
@@ -82,7 +83,7 @@ def test_names_that_are_markup_are_text(server, page, photographs):
     (folder / "<img src=y onerror=alert(2)>.txt").rename(folder / "&lt;img src=y onerror=alert(2)&gt;.txt")
     page.set_input_files("#folder", folder)
     page.get_by_text("(&lt;img src=y onerror=alert(2)&gt;.txt)").first.wait_for(timeout=UPLOAD_MS)
-    assert page.locator("main img").count() == 0
+    expect(page.locator("main img")).to_have_count(0)
 
 
 def test_a_lost_server_is_told_and_waited_for(server, page, photographs):

@@ -7,7 +7,7 @@ import pytest
 from service.requests.keys import NewKey, Scope
 from service.server.database import keys
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import SAMPLES, new_context
+from tests.service.server.pages.conftest import SAMPLES, expect, new_context
 from tests.service.server_process import serving
 
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
@@ -32,7 +32,7 @@ def test_what_does_not_exist_is_a_page_with_a_way_on(browser, server, path):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
     page.goto(path)
     page.locator(".fault-page").wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
     assert violations_in_both_schemes(page) == []
     page.get_by_role("link", name="All captures").click()
     page.wait_for_url(re.compile("/$"))
@@ -48,7 +48,8 @@ def test_a_key_that_is_refused_is_told_why(browser, tmp_path):
         page = new_context(browser, base_url=locked.url, bypass_csp=True).new_page()
         page.goto("/captures")
         fault = page.locator("#key-fault")
-        assert fault.is_hidden()
+        expect(page.get_by_role("textbox", name="Key")).to_be_visible()
+        expect(fault).to_be_hidden()
         for given, words in {"wrong": "this service does not know the key", f"{revoked}x": "this service does not know the key",
                              revoked: "the key was revoked on ", expired: "the key expired on "}.items():
             page.get_by_role("textbox", name="Key").fill(given)

@@ -9,9 +9,8 @@ import pytest
 
 from service.requests.keys import Scope
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import keep, new_context
+from tests.service.server.pages.conftest import await_whole, expect, keep, new_context, seen
 from tests.service.server_process import serving
-from tests.service.waiting import until
 
 CAPTURES = 1000
 EVIL = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
@@ -59,32 +58,35 @@ def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  #
     return submitted
 
 
-def names(page) -> list[str]:
-    return page.locator("#wall h3").all_inner_texts()
-
-
 def test_a_thousand_captures_are_searched_sorted_and_filtered(page):
     found = [capture(number) for number in range(CAPTURES)]
     found[7] = capture(7, steps=3) | {"name": EVIL}
     submitted = pretend(page, found)
     page.goto("/?words=bird+99")
     page.get_by_text(f"{sum('99' in str(number) for number in range(CAPTURES))} of {CAPTURES}").wait_for()
-    page.locator("#strip li").wait_for()
+    page.locator("#strip li").first.wait_for()
+    names = page.locator("#wall h3")
     page.get_by_label("Search by name").fill("")
     page.get_by_text(f"{CAPTURES} in all").wait_for()
-    assert page.url.endswith("/") and len(names(page)) == SHOWN
+    page.wait_for_url(re.compile("/$"))
+    expect(names).to_have_count(SHOWN)
     page.locator("#order").select_option("name")
-    assert names(page)[1:4] == ["bird 0", "bird 1", "bird 2"]  # numbers by value, and the other name before them
+    for at in range(3):
+        expect(names.nth(1 + at)).to_have_text(f"bird {at}")  # numbers by value, and the other name before them
     page.locator("#order").select_option("oldest")
-    assert names(page)[0] == "bird 0"
+    expect(names.first).to_have_text("bird 0")
     page.locator(".chips label", has_text="Sequences").click()
     page.get_by_text(f"1 of {CAPTURES}").wait_for()
-    assert names(page) == [EVIL] and page.locator("#wall img, #wall script").count() == 0 and page.title() == "Home · Relit"
-    assert page.get_by_text("3 time steps · 96 frames · 320 × 320").is_visible()
+    expect(names).to_have_text([EVIL])
+    expect(page.locator("#wall img, #wall script")).to_have_count(0)
+    expect(page).to_have_title("Home · Relit")
+    expect(page.get_by_text("3 time steps · 96 frames · 320 × 320")).to_be_visible()
+    seen(page, lambda: submitted, "no view is prepared")
     assert [each["kind"] for each in submitted] == ["view"]  # one view is prepared at a time
     page.reload()
     page.get_by_text(f"1 of {CAPTURES}").wait_for()
-    assert page.get_by_label("Sequences").is_checked() and page.locator("#order").input_value() == "oldest"
+    expect(page.get_by_label("Sequences")).to_be_checked()
+    expect(page.locator("#order")).to_have_value("oldest")
 
 
 def test_jobs_say_why_they_wait_and_how_they_failed(page):
@@ -97,18 +99,20 @@ def test_jobs_say_why_they_wait_and_how_they_failed(page):
     page.goto("/")
     strip = page.locator("#strip")
     strip.get_by_text("normals 3 of 12, 9.0 s left").wait_for()
-    assert strip.get_by_text("behind Solve normals and materials · bird 1, which runs").count() == 1  # of the highest priority
+    expect(strip.get_by_text("behind Solve normals and materials · bird 1, which runs")).to_have_count(1)  # of the highest priority
     strip.get_by_text("behind 2 jobs, first Solve normals and materials · bird 1, which runs").wait_for()
     strip.get_by_text("behind 3 jobs, first Solve normals and materials · bird 1, which runs").wait_for()
     strip.get_by_text("bird: no frame can be read").wait_for()
-    assert strip.locator("li").count() == 5 and strip.locator("img").count() == 0
+    expect(strip.locator("li")).to_have_count(5)
+    expect(strip.locator("img")).to_have_count(0)
 
 
 def test_nothing_yet_says_what_to_do(page):
     pretend(page, [])
     page.goto("/")
     page.get_by_role("heading", name="Nothing here yet").wait_for()
-    assert page.get_by_text("Choose a folder").is_visible() and page.locator(".skeleton:visible").count() == 0
+    expect(page.get_by_text("Choose a folder")).to_be_visible()
+    expect(page.locator(".skeleton:visible")).to_have_count(0)
     page.get_by_text(f"Project {EVIL}").wait_for()
 
 
@@ -129,17 +133,18 @@ def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card
     page.goto("/")
     page.get_by_role("button", name="Open the sample owl").click()
     page.locator(".card a", has_text="owl").wait_for()
-    assert page.locator("#sample").is_disabled()
-    until(lambda: page.wait_for_timeout(10) or held, "the environment is not asked for")
+    expect(page.locator("#sample")).to_be_disabled()
+    seen(page, lambda: held, "the environment is not asked for")
     held[0].fulfill(status=201, json=capture(2) | {"id": f"env_{2:020d}", "name": "sky", "facts": {}})
     page.locator(".card", has_text="sky").wait_for()
     page.wait_for_function("() => document.activeElement.closest('.card') !== null && !document.getElementById('sample').disabled")
     assert len(set(tokens)) == len(tokens) == 2
     page.get_by_role("button", name="Close", exact=True).click()
-    assert not page.locator("#drop").is_visible() and page.evaluate("document.activeElement.id") == "add"
+    expect(page.locator("#drop")).to_be_hidden()
+    expect(page.locator("#add")).to_be_focused()
     with page.expect_file_chooser():
         page.get_by_role("button", name="Add a folder").click()
-    assert page.locator("#drop").is_visible()
+    expect(page.locator("#drop")).to_be_visible()
 
 
 @pytest.mark.long
@@ -153,7 +158,7 @@ def test_the_sample_is_opened_by_one_click_where_nothing_is_yet(browser, tmp_pat
         page.get_by_role("button", name="Open the sample owl").click()
         page.locator(".card", has_text="owl").locator("canvas").wait_for()  # it was checked, and has a view
         page.get_by_text("Project larch").wait_for()
-        assert sorted(names(page)) == ["environment.exr", "owl"]
+        seen(page, lambda: sorted(page.locator("#wall h3").all_inner_texts()) == ["environment.exr", "owl"])
         page.locator(".card a", has_text="owl").click()
         page.locator("canvas.picture[data-ready]").wait_for()
         context.close()
@@ -183,22 +188,24 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
     card = page.locator(f"[data-id={solved.capture}]")
     await_picture(page, solved.capture)
     light = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 4 === 0)"
-    seen, pictures = {}, [card.locator("canvas").evaluate(light)]
+    sums, pictures = {}, [card.locator("canvas").evaluate(light)]
 
     def lit_from(x: float) -> list[int] | None:
         """The picture under the pointer, when it is another one than before; the wall may move, and make the card anew, meanwhile."""
         box = card.locator(".shown").bounding_box()
+        if box is None:
+            return None
         page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.4 * box["height"])
         page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
         red = card.locator("canvas").evaluate(light)
         return None if red in pictures else red
 
     for side, x in {"left": 0.1, "right": 0.9}.items():
-        red = until(lambda x=x: lit_from(x))
+        red = seen(page, lambda x=x: lit_from(x))
         pictures.append(red)
         width = round(len(red) ** 0.5)
-        seen[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
-    assert seen["left"][0] > seen["right"][0] and seen["left"][1] < seen["right"][1]
+        sums[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
+    assert sums["left"][0] > sums["right"][0] and sums["left"][1] < sums["right"][1]
     await_picture(page, sky)
     card.get_by_role("link").press("Enter")
     page.wait_for_url(re.compile(f"/{solved.capture}$"))
@@ -210,7 +217,8 @@ def test_the_wall_fits_and_has_no_violation(browser, server, solved, sky, width)
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": width, "height": 844}).new_page()
     page.goto("/")
     await_picture(page, solved.capture)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    await_whole(page)
+    page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
     assert violations_in_both_schemes(page) == []
     page.close()
 
@@ -219,13 +227,14 @@ def test_the_wall_fits_and_has_no_violation(browser, server, solved, sky, width)
 def test_the_wall_is_used_by_the_keyboard_alone(page, solved):
     page.goto("/")
     page.locator(f"[data-id={solved.capture}] h3").wait_for()
+    await_whole(page)
     page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.className") == "skip"
+    expect(page.locator(".skip")).to_be_focused()
     page.get_by_label("Search by name").focus()
     page.keyboard.type("lambert")
     for key in ("Tab", "ArrowRight"):  # the kinds are one stop, and arrow keys choose
         page.keyboard.press(key)
-    assert page.get_by_label("Captures", exact=True).is_checked()
+    expect(page.get_by_label("Captures", exact=True)).to_be_checked()
     page.wait_for_function("() => new URLSearchParams(location.search).get('kind') === 'capture'")
 
 
@@ -237,12 +246,11 @@ def test_light_and_dark_are_chosen_and_kept(browser, server):
     paper = "() => getComputedStyle(document.body).backgroundColor"
     light = page.evaluate(paper)
     page.get_by_role("button", name="Show in dark").click()
-    dark = page.evaluate(paper)
-    assert light != dark
+    dark = seen(page, lambda: (now := page.evaluate(paper)) != light and now)
     page.goto("/captures")
-    assert page.evaluate(paper) == dark
+    page.wait_for_function(f"(dark) => ({paper})() === dark", arg=dark)
     page.get_by_role("button", name="Show in light").click()
-    assert page.evaluate(paper) == light
+    page.wait_for_function(f"(light) => ({paper})() === light", arg=light)
     context.close()
 
 

@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from tests.service.server.pages.conftest import await_whole, expect, seen
+
 pytestmark = pytest.mark.long
 
 HOSTILE = "<img src=x onerror=alert(1)>"
@@ -39,7 +41,8 @@ def test_a_name_that_is_markup_is_text(page, solved, place, path, names):
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     page.route(path, answer)
     page.goto({"home": "/", "captures": "/captures", **solved.pages}[place])
-    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    await_whole(page)
     if "report" not in path:
         page.wait_for_function("(text) => document.querySelector('main').textContent.includes(text)", arg=HOSTILE)
-    assert asked and page.locator("main img").count() == 0
+    seen(page, lambda: asked, "nothing is asked for")
+    expect(page.locator("main img")).to_have_count(0)

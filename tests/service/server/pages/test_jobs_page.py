@@ -15,7 +15,7 @@ from service.client import Client
 from service.server.pages.forms import BEGIN_WITH, NEXT_STEPS, TITLES
 from tests.scenes.captures import write_exr
 from tests.service.server.api.job_calls import admitted
-from tests.service.server.pages.conftest import SAMPLES, new_context
+from tests.service.server.pages.conftest import SAMPLES, await_whole, expect, new_context, seen
 from tests.service.server.tcp_proxy import tcp_proxy
 
 pytestmark = pytest.mark.long
@@ -46,44 +46,49 @@ def patterns(server, tmp_path_factory) -> str:
         return client.captures.upload(folder).id
 
 
-def offered(page) -> set[str]:
-    """Open all that a capture's page offers, and return the kinds of jobs."""
-    page.locator("#work:not([hidden])").wait_for()
+def await_offers(page, kinds: set[str]) -> None:
+    """Open all that a capture's page offers, and wait until it is these kinds of jobs."""
     page.locator("#more > summary").click()
-    forms = page.locator(".job-form:visible form[data-kind]")
-    return set(forms.evaluate_all("all => all.map((each) => each.dataset.kind)"))
+    page.wait_for_function("""(kinds) => {
+      const forms = [...document.querySelectorAll("form[data-kind]")].filter((each) => each.parentElement.checkVisibility());
+      return JSON.stringify(forms.map((each) => each.dataset.kind).sort()) === JSON.stringify(kinds);
+    }""", arg=sorted(kinds))
 
 
 def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot_apply(server, page, capture, patterns):
     page.goto(f"/captures/{patterns}")
     page.get_by_role("heading", name="<b>stripes", level=1).wait_for()
-    assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "pattern" in what}
-    assert page.locator("#next > button[data-kind]:visible").all_inner_texts() == [TITLES[kind] for kind in NEXT_STEPS["pattern"]]
+    await_offers(page, {kind for kind, what in BEGIN_WITH.items() if "pattern" in what})
+    expect(page.locator("#next > button[data-kind]:visible")).to_have_text([TITLES[kind] for kind in NEXT_STEPS["pattern"]])
     page.goto(f"/captures/{capture}")
     page.get_by_role("link", name="Light it").wait_for()
-    assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "light" in what}
-    buttons = page.locator("#next .button:visible, #next button:visible")
-    assert buttons.evaluate_all("all => all.filter((each) => !each.matches('.quiet')).length") == 1  # one that stands out
+    await_offers(page, {kind for kind, what in BEGIN_WITH.items() if "light" in what})
+    expect(page.locator("#next :is(.button, button):not(.quiet):visible")).to_have_count(1)  # one that stands out
     page.get_by_role("button", name=TITLES["pipeline"]).click()
     page.wait_for_url("**/object/cap_*")
-    page.locator("#work").get_by_role("link", name="Details").click()
-    page.locator("#request dd", has_text=capture).wait_for()
-    page.locator("#usual-part > summary").click()
-    request = page.locator("#request, #usual").all_inner_texts()
-    assert "[object" not in "".join(request) and "{" not in "".join(request)
-    names = page.locator("#request dt, #usual dt").all_inner_texts()
-    assert len(names) == len(set(names)) and {"Capture", "Clip negative", "Textures"} <= set(names)
     with server.client() as client:
-        client.post(f"/v1/jobs/{page.url.rpartition('/')[2]}/cancel")
+        jobs = client.get("/v1/jobs", params={"kind": "pipeline", "limit": 500}).json()["jobs"]
+        job, = [each["id"] for each in jobs if each["request"]["capture"] == capture]
+        page.goto(f"/jobs/{job}")  # on the page of the object its line goes when it has succeeded
+        expect(page.locator("#request dd", has_text=capture)).to_be_visible()
+        page.locator("#usual-part > summary").click()
+        expect(page.locator("#usual dt").first).to_be_visible()
+        request = page.locator("#request, #usual").all_inner_texts()
+        assert "[object" not in "".join(request) and "{" not in "".join(request)
+        names = page.locator("#request dt, #usual dt").all_inner_texts()
+        assert len(names) == len(set(names)) and {"Capture", "Clip negative", "Textures"} <= set(names)
+        client.post(f"/v1/jobs/{job}/cancel")
 
 
 def test_a_deletion_is_undone_and_done(server, page):
-    """Time is the page's own clock, which the test moves."""
+    """Time is the page's own clock, which the test stops and moves."""
     with server.client() as client:
         capture = admitted(server, client, SAMPLES / "lambert")["id"]
         page.clock.install()
         page.goto(f"/captures/{capture}")
         page.locator("#frames canvas").first.wait_for(timeout=JOB_MS)  # a capture that a job still reads is not deleted
+        await_whole(page)
+        page.clock.pause_at(page.evaluate("Date.now()") + 30_000)  # later than now, however slow the machine is
         for _ in range(2):
             page.get_by_role("button", name="Delete").click()
             page.get_by_role("alert").get_by_text("lambert is deleted in 8 s.").wait_for()
@@ -99,6 +104,7 @@ def test_a_deletion_is_undone_and_done(server, page):
 def opened_form(page, title: str, options: bool = True):
     """Open the form of a job, its options and what shows it as a command."""
     page.locator("#work:not([hidden])").wait_for()
+    await_whole(page)
     summary = page.locator("summary", has_text=title).first
     if not summary.is_visible():
         page.locator("#more > summary").click()
@@ -134,8 +140,7 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
         found = client.get(f"/v1/jobs/{job}").json()
         assert (found["request"]["options"]["method"], found["priority"]) == ("lambert", 60)
         report = client.get(f"/v1/jobs/{job}/results/report.json").json()
-    shown = page.locator("#stages tbody tr").all_inner_texts()
-    assert [row.split()[0] for row in shown] == list(report["timings_s"])
+    expect(page.locator("#stages tbody td:first-child")).to_have_text(list(report["timings_s"]))
     page.locator("summary", has_text="Log").click()
     page.locator("#log li", has_text="attempt 1: succeeded").wait_for()
     with page.expect_download() as download:
@@ -150,8 +155,7 @@ def test_patterns_are_drawn_from_the_page_of_jobs(page):
     form.get_by_label("Code").select_option("phase")
     form.get_by_label("Projector").fill("64x32")
     form.get_by_label("Periods", exact=True).fill("16,18")
-    command = form.locator("[data-shows=command]").inner_text()
-    assert " patterns phase " in command and command.endswith(" --projector 64x32 --periods 16,18")
+    expect(form.locator("[data-shows=command]")).to_have_text(re.compile(r" patterns phase .*--projector 64x32 --periods 16,18$"))
     submitted(page)
     page.locator(".state.succeeded").wait_for(timeout=JOB_MS)
     page.locator("#results").get_by_text("patterns.json").wait_for()
@@ -162,16 +166,40 @@ def test_forms_of_several_captures_and_images(page, capture, patterns):
     form = opened_form(page, "Calibrate camera and projector", options=False)
     form.get_by_label("Board").fill("9x6")
     form.get_by_label("Square (metres)").fill("0.03")
-    command = form.locator("[data-shows=command]").inner_text()
-    assert f"calibrate-procam {patterns} " in command and command.endswith("--board 9x6 --square-m 0.03")  # the page's capture is entered
+    command = form.locator("[data-shows=command]")  # the page's capture is entered
+    expect(command).to_have_text(re.compile(rf"calibrate-procam {patterns} .*--board 9x6 --square-m 0\.03$"))
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate the dark frame", options=False)
     form.get_by_label("Images").fill("b.exr\na.exr")
-    assert f"calibrate-dark {capture} b.exr a.exr" in form.locator("[data-shows=command]").inner_text()
+    expect(command).to_contain_text(f"calibrate-dark {capture} b.exr a.exr")
     form.get_by_label("Images").fill("")
-    submit = form.locator("button[type=submit]")
-    submit.click()
+    form.locator("button[type=submit]").click()
     form.locator(".fault", has_text="Images: ").wait_for()
+
+
+def test_a_form_can_be_sent_before_its_lists_have_come_and_what_is_chosen_meanwhile_stays(server, page, capture):
+    """The page's capture is in the form at once; another one that is chosen while the list still comes is not put back."""
+    first, second = ({"id": f"cap_{each * 20}", "name": each, "state": "ready"} for each in "ab")
+    held = []
+
+    def listed(route):
+        if "before=" in route.request.url:
+            held.append(route)
+        else:
+            route.fulfill(json={"items": [first], "next": first["id"]})
+
+    page.route(re.compile(r"/v1/captures(\?|$)"), listed)
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Solve normals", options=False)
+    command, chosen = form.locator("[data-shows=command]"), form.get_by_label("Capture", exact=True)
+    expect(command).to_contain_text(f" solve {capture}")
+    chosen.select_option(first["id"])
+    expect(command).to_contain_text(f" solve {first['id']}")
+    seen(page, lambda: held, "the second part of the list is not asked for")
+    held[0].fulfill(json={"items": [second], "next": None})
+    expect(chosen.locator("option")).to_have_count(4)  # none, the page's and both of the list
+    expect(chosen).to_have_value(first["id"])
+    expect(command).to_contain_text(f" solve {first['id']}")
 
 
 def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
@@ -183,7 +211,9 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     form.get_by_label("Exposure").fill("-1.5")
     form.get_by_label("Name").fill("it's a test")
     form.get_by_label("Align", exact=True).uncheck()
-    command, curl = (form.locator(f"[data-shows={name}]").inner_text() for name in ("command", "curl"))
+    command, curl = (form.locator(f"[data-shows={name}]") for name in ("command", "curl"))
+    expect(curl).to_contain_text("s a test")
+    command, curl = command.inner_text(), curl.inner_text()  # both are written at once
     job = submitted(page)
     done = subprocess.run([sys.executable, "-m", "service.cli.main", *shlex.split(command)[1:]], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -205,8 +235,7 @@ def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, c
     form.get_by_label("Align to").fill("nothing.png")
     form.get_by_role("button", name="Submit").click()
     page.wait_for_url("**/jobs/job_*")
-    page.locator("#error").wait_for(timeout=JOB_MS)  # the service says what it is that it does not find
-    assert page.locator("#error").inner_text().strip()
+    expect(page.locator("#error")).to_have_text(re.compile(r"\S"), timeout=JOB_MS)  # the service says what it is that it does not find
     page.get_by_role("button", name="Retry").click()
     page.locator("#state").get_by_text("attempt 2").wait_for(timeout=JOB_MS)
 
@@ -242,7 +271,7 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
         client.post(f"/v1/jobs/{job}/cancel")
         way.mend()
         page.locator(".state.cancelled").wait_for(timeout=JOB_MS)
-        assert page.locator("#connection").is_hidden()
+        expect(page.locator("#connection")).to_be_hidden()
         page.close()
 
 

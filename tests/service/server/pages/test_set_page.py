@@ -17,7 +17,7 @@ from stage.capture.capture import Capture
 from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, keep, new_context
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, keep, new_context
 from tests.service.server_process import serving
 
 ROOT = SAMPLES.parent
@@ -124,19 +124,19 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
     """With the keyboard alone; the sample is there for the picture of the documentation."""
     with stage(tmp_path, sample=PICTURES is not None, serve=("--device", "cpu")) as (server, captures):
         with opened(browser, server, bypass_csp=True, color_scheme="light") as page:  # axe is injected
-            assert page.get_by_role("button", name="Live view").count() == 0  # a watched folder has none
-            assert page.get_by_role("navigation").get_by_role("link", name="Set").get_attribute("href") == "/set"
+            expect(page.locator("[data-step=chart]")).to_contain_text("The colours are those of the camera.")
+            expect(page.get_by_role("button", name="Live view")).to_have_count(0)  # a watched folder has none
+            expect(page.get_by_role("navigation").get_by_role("link", name="Set")).to_have_attribute("href", "/set")
             assert_accessible(page)
-            assert "The colours are those of the camera." in page.locator("[data-step=chart]").inner_text()
             page.get_by_label("Capture", exact=True).fill("owl")
             page.get_by_role("button", name="Colour chart: Add").press("Enter")
-            assert page.get_by_label("Plan").input_value() == "dark,chart,olat"
+            expect(page.get_by_label("Plan")).to_have_value("dark,chart,olat")
             page.get_by_role("button", name="Colour chart: Leave out").press("Enter")
             page.get_by_role("button", name="Take the capture").press("Enter")
             page.get_by_role("button", name="Make an asset").wait_for()
             page.locator("canvas[data-turns=true]").wait_for()
-            assert "✓" in page.locator("[data-step=object]").inner_text()
-            assert "1 of 1 picture" in page.locator("[data-step=dark]").inner_text()
+            expect(page.locator("[data-step=object]")).to_contain_text("✓")
+            expect(page.locator("[data-step=dark]")).to_contain_text("1 of 1 picture")
             assert_turns(page)
             assert_accessible(page)
             page.evaluate("() => scrollTo(0, 0)")
@@ -161,10 +161,13 @@ def assert_turns(page) -> None:
     before = page.evaluate(direction)
     page.wait_for_function(f"(before) => Math.hypot(...({direction})().map((each, axis) => each - before[axis])) > 0.1", arg=before)
     picture = page.locator("canvas.picture")
-    picture.hover(position={"x": 5, "y": picture.bounding_box()["height"] / 2})
-    assert page.evaluate(direction)[0] < -0.5  # it follows at once, and stays for a while
+    height = picture.bounding_box()["height"]
+    for x in (5, 6):  # a page that has stood still meanwhile follows the next move
+        picture.hover(position={"x": x, "y": height / 2})
+    page.wait_for_function(f"() => ({direction})()[0] < -0.5")  # it follows at once, and stays for a while
+    before = page.evaluate(direction)[1]
     picture.press("ArrowUp")
-    assert page.evaluate(direction)[1] > 0.05
+    page.wait_for_function(f"(before) => ({direction})()[1] > before", arg=before)
     page.emulate_media(reduced_motion="reduce")
     page.locator("canvas[data-turns=false]").wait_for()
     page.get_by_role("button", name="Turn the light").press("Enter")
@@ -182,9 +185,9 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         page.get_by_role("button", name="Done").click()
         mend = page.get_by_role("button", name="Take those with a fault again")
         mend.wait_for()
-        assert page.locator("#now").inner_text().startswith(f"{LAMPS + 2} of {LAMPS + 2} pictures, 1 with a fault.")
+        expect(page.locator("#now")).to_contain_text(f"{LAMPS + 2} of {LAMPS + 2} pictures, 1 with a fault.")
         page.locator("#dome title", has_text="lamp 2: did not light: has 0").wait_for(state="attached")
-        assert "1 with a fault" in page.locator("[data-step=object]").inner_text()
+        expect(page.locator("[data-step=object]")).to_contain_text("1 with a fault")
         assert_accessible(page)
         page.get_by_role("button", name="0006_light_004", exact=True).click()
         page.locator("#picture[data-shown*='0006_light_004']").wait_for()
@@ -213,10 +216,10 @@ def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(br
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#now", has_text="1 of 1 pictures").wait_for()
         page.get_by_role("button", name="Object: New capture with it").click()
-        assert page.get_by_label("Plan").input_value() == "dark,olat"
+        expect(page.get_by_label("Plan")).to_have_value("dark,olat")
         page.get_by_role("button", name="White card: Add").click()
-        values = page.get_by_label("Capture", exact=True).input_value(), page.get_by_label("Plan").input_value()
-        assert values == ("ball-2", "dark,flat,olat")
+        expect(page.get_by_label("Capture", exact=True)).to_have_value("ball-2")
+        expect(page.get_by_label("Plan")).to_have_value("dark,flat,olat")
         page.get_by_role("button", name="Meter the light").click()
         page.locator("#metered[data-shown]").wait_for()
         page.locator("#now", has_text="The meter proposes").wait_for()
@@ -229,7 +232,8 @@ def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(br
         page.locator("#prompt", has_text="put the mirror ball").wait_for()
         page.get_by_role("button", name="Stop").click()
         page.get_by_role("button", name="Take the capture").wait_for()
-        assert page.get_by_label("Capture", exact=True).input_value() == "ball-ball" and not list((captures / "ball-ball").glob("*.png"))
+        expect(page.get_by_label("Capture", exact=True)).to_have_value("ball-ball")
+        assert not list((captures / "ball-ball").glob("*.png"))
 
 
 @pytest.mark.long
@@ -246,7 +250,7 @@ def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tm
         lamps.fill("3-4, 6")
         for name in ("lamp 5:", "lamp 6:"):  # the sixth and the seventh
             page.locator("#dome circle").filter(has_text=name).click()
-        assert lamps.input_value() == "3-4, 7"
+        expect(lamps).to_have_value("3-4, 7")
         tracking.fill("2")
         assert_accessible(page)
         page.get_by_role("button", name="Take the capture").click()
@@ -266,8 +270,9 @@ def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tm
 
         page.get_by_label("Capture", exact=True).fill("some")
         page.get_by_label("Capture", exact=True).press("Tab")
-        page.wait_for_function("() => document.getElementById('lights').value === '3-4, 7'")
-        assert (tracking.input_value(), times.input_value()) == ("2", "")
+        expect(lamps).to_have_value("3-4, 7")
+        expect(tracking).to_have_value("2")
+        expect(times).to_have_value("")
 
 
 @pytest.mark.long
@@ -295,10 +300,10 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
         window.context.close()
         frames = Capture.open(server.data / "set" / "capture").manifest.frames
         assert len(frames) == taken == 2 + 2 * 6  # white, black, and six bits of 64 columns with their inverses
-        assert not link.is_visible()
+        expect(link).to_be_hidden()
         page.get_by_role("button", name="Solve").click()
         page.get_by_role("link", name="Its maps").wait_for()
-        assert "The patterns are decoded." in page.locator("#now").inner_text()
+        expect(page.locator("#now")).to_contain_text("The patterns are decoded.")
 
 
 @pytest.mark.long
@@ -315,7 +320,7 @@ def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_pat
         page.get_by_label("Plan").fill("dark")
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#now", has_text="1 of 1 pictures").wait_for()
-        assert not page.locator("#seen").is_visible()
+        expect(page.locator("#seen")).to_be_hidden()
         settings = json.loads((server.data / "set" / "capture" / "report.json").read_text())["camera_settings"]
         assert settings["DeviceVendorName"] == "Aravis"
 
@@ -336,9 +341,10 @@ def test_the_live_view_says_what_clips_and_ends_before_a_capture(browser, tmp_pa
         live.press("Enter")
         page.locator("#seen-words", has_text="50.0 % clipped").wait_for()
         page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
-        assert live.get_attribute("aria-pressed") == "true"
+        expect(live).to_have_attribute("aria-pressed", "true")
         assert_accessible(page)
         page.get_by_label("Plan").fill("olat")
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#now", has_text=f"{LAMPS} of {LAMPS} pictures").wait_for()
-        assert live.get_attribute("aria-pressed") == "false" and not page.locator("#seen").is_visible()
+        expect(live).to_have_attribute("aria-pressed", "false")
+        expect(page.locator("#seen")).to_be_hidden()

@@ -13,7 +13,7 @@ import pytest
 from service.play.play import play
 from service.requests.play import PlayRequest
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
-from tests.service.server.pages.conftest import SAMPLES, keep, new_context
+from tests.service.server.pages.conftest import SAMPLES, expect, keep, new_context
 
 ROOT = SAMPLES.parent
 
@@ -38,19 +38,20 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         page, errors = context.new_page(), []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)
-        assert page.locator("#state").inner_text().startswith("Waiting")
+        expect(page.locator("#state")).to_contain_text("Waiting")
         player.start()
         page.locator("#state", has_text="frames received").wait_for()
         brightest = int(np.argmax(steps.reshape(-1, 3)[:, 0]))
         red, green, blue = (round(value / 2.55, 1) for value in steps.reshape(-1, 3)[brightest])
         page.locator("#dome title", has_text=f"lamp {brightest}: {red:.1f} %, {green:.1f} %, {blue:.1f} %").wait_for(state="attached")
-        assert page.evaluate("getComputedStyle(document.body).getPropertyValue('--paper')") != ""  # the colours of the pages are there
+        # the colours of the pages are there
+        page.wait_for_function("() => getComputedStyle(document.body).getPropertyValue('--paper') !== ''")
         keep(page, "twin", tmp_path)
         stop.set()
         player.join()
         page.locator("#dome title", has_text=f"lamp {brightest}: 0.0 %, 0.0 %, 0.0 %").wait_for(state="attached")
         program.send_signal(signal.SIGINT)
-        assert program.wait(timeout=20) == 0
+        assert program.wait(timeout=120) == 0
         page.locator("#state", has_text="The twin has ended.").wait_for()
         context.close()
         assert errors == []

@@ -2,7 +2,7 @@
 
 import { attempt, load, newToken, postOnce, read, Refusal, send } from "../api.js";
 import { mountDropZone } from "../upload/drop_zone.js";
-import { byId, show } from "../element.js";
+import { byId, setChildren, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
 import { cardOf, setPicture } from "./card.js";
 import { assetItem, chosen, intakeItem, itemsOf } from "./items.js";
@@ -36,7 +36,7 @@ function draw() {
   const asks = { words: wanted.words.value, kind: wanted.kind.value, order: wanted.order.value };
   const found = chosen(items.values(), asks);
   const focused = document.activeElement;
-  byId("wall").replaceChildren(...found.slice(0, most).map((item) => cards.get(item.id) ?? makeCard(item)));
+  setChildren(byId("wall"), found.slice(0, most).map((item) => cards.get(item.id) ?? makeCard(item)));
   if (byId("wall").contains(focused)) focused.focus({ preventScroll: true }); // what is moved loses it
   byId("count").textContent = !isLoaded || items.size === 0 ? "" : found.length === items.size ? `${found.length} in all` : `${found.length} of ${items.size}`;
   show(byId("more"), found.length > most);

@@ -1,11 +1,12 @@
 /** The jobs that run, wait or have failed lately, in a strip, with the reason why each waits. */
 
-import { element, show } from "../element.js";
+import { element, setChildren, show } from "../element.js";
 import { progressOf } from "../jobs_table.js";
 
 const FAILED_HOURS = 24;
 const MOST_FAILED = 3;
 const ACTIVE = ["running", "queued"];
+const lines = new Map(); // of the jobs that were shown
 
 /**
  * Return why a job waits.
@@ -30,10 +31,16 @@ export function showStrip(strip, jobs, title, fault) {
   const since = Date.now() - FAILED_HOURS * 3_600_000;
   const failed = jobs.filter((job) => job.state === "failed" && Date.parse(job.finished_at) > since).slice(0, MOST_FAILED);
   const shown = [...active.filter((job) => job.state === "running"), ...failed, ...active.filter((job) => job.state === "queued")];
-  strip.replaceChildren(...shown.map((job) => element("li", { class: job.state },
-    element("a", { href: `/jobs/${job.id}` }, title(job)),
-    job.state === "running" && job.progress?.total > 0
-      ? element("progress", { value: job.progress.done, max: job.progress.total, "aria-label": `Progress of ${title(job)}` }) : null,
-    element("p", {}, job.state === "queued" ? reasonOf(job, active, title, fault) : progressOf(job) || job.state))));
+  setChildren(strip, shown.map((job) => {
+    if (!lines.has(job.id)) lines.set(job.id, element("li", {}, element("a", { href: `/jobs/${job.id}` })));
+    const line = lines.get(job.id);
+    line.className = job.state;
+    line.firstChild.textContent = title(job);
+    const isMeasured = job.state === "running" && job.progress?.total > 0;
+    setChildren(line, [line.firstChild,
+      ...(isMeasured ? [element("progress", { value: job.progress.done, max: job.progress.total, "aria-label": `Progress of ${title(job)}` })] : []),
+      element("p", {}, job.state === "queued" ? reasonOf(job, active, title, fault) : progressOf(job) || job.state)]);
+    return line;
+  }));
   show(strip, shown.length > 0);
 }

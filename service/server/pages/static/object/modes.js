@@ -57,7 +57,9 @@ async function mountCompared(parent, jobs) {
   const [first, second] = [choice("Maps", 0), choice("Compared with", 1)];
   const place = element("div");
   const again = () => attempt(async () => {
-    const [one, other] = await Promise.all([first.value, second.value].map((job) => viewOf(job, place)));
+    const wanted = [first.value, second.value];
+    const [one, other] = await Promise.all(wanted.map((job) => viewOf(job, place)));
+    if (first.value !== wanted[0] || second.value !== wanted[1]) return; // others were chosen meanwhile
     if (one.info.rows !== other.info.rows || one.info.cols !== other.info.cols) throw new Error("these maps have different sizes");
     await mountResults(place, one, [{ name: second.selectedOptions[0].textContent, view: other }]);
   });

@@ -93,7 +93,11 @@ await load(async () => {
     byId("picture-of-object").replaceChildren();
     if (capture === "") return;
     const { files } = await openView(capture, null, null, byId("picture-of-object"));
-    object = await mountObject(byId("picture-of-object"), await ViewFile.open(files), directions, light, rig.color_space ?? DISPLAY_SPACE);
+    const mounted = element("div");
+    const made = await mountObject(mounted, await ViewFile.open(files), directions, light, rig.color_space ?? DISPLAY_SPACE);
+    if (byId("object").value !== capture) return; // another was chosen meanwhile
+    byId("picture-of-object").replaceChildren(mounted);
+    object = made;
     views.push(object);
     present();
   });

@@ -1,20 +1,21 @@
 /** The page for operators: workers and what each does, the queue, the space left, the last errors, and the audit log. */
 
 import { attempt, load, post, read, Refusal } from "../api.js";
-import { byId, bytes, element, icon, show, time, words } from "../element.js";
+import { byId, bytes, element, icon, setChildren, show, time, words } from "../element.js";
 import { progressOf, titleOf } from "../jobs_table.js";
 
 const REFRESH_MS = 5000;
 const ERRORS = 10;
 const QUESTIONS = { drain: "Let this worker finish its step, give its job back and end?", kill: "Kill this worker at once? Its step is lost; another worker goes on with the job." };
 const PAGES = { cap: "captures", job: "jobs" }; // of identifiers
+const shown = new Map(); // of each worker, the line that it has and what that says
 let next = null; // page of the audit log
 
 async function look() {
   const [machines, { jobs: failed }] = await Promise.all([read("/v1/machines"), read(`/v1/jobs?state=failed&limit=${ERRORS}`)]);
   show(byId("view"), true);
   byId("faults").replaceChildren(...machines.faults.map((fault) => element("li", {}, fault)));
-  byId("workers").replaceChildren(...lines(machines.workers.map(workerLine), "No worker was seen lately."));
+  setChildren(byId("workers"), lines(machines.workers.map(lineOf), "No worker was seen lately."));
   byId("errors").replaceChildren(...lines(failed.map(errorLine), "No job of this project has failed."));
   const { disk } = machines;
   const figures = { ...Object.fromEntries(Object.entries(machines.jobs).map(([state, count]) => [`Jobs ${state}`, String(count)])),
@@ -26,6 +27,15 @@ async function look() {
 
 function lines(found, nothing) {
   return found.length > 0 ? found : [element("li", { class: "help" }, nothing)];
+}
+
+/** Return the line of a worker, the same one as long as nothing changes but when the worker was seen. */
+function lineOf({ seen_at: seen, ...worker }) {
+  const says = JSON.stringify(worker);
+  if (shown.get(worker.id)?.says !== says) shown.set(worker.id, { says, line: workerLine(worker) });
+  const { line } = shown.get(worker.id);
+  line.querySelector("small").replaceChildren("began ", time(worker.started_at), ", seen ", time(seen));
+  return line;
 }
 
 function workerLine(worker) {
@@ -41,7 +51,7 @@ function workerLine(worker) {
     disabled: worker.asked === "kill" || worker.asked === what, onclick: () => ask(what) }, words(what));
   return element("li", {}, icon("machine"), element("div", {}, element("strong", {}, worker.device),
     ` ${worker.host}, process ${worker.pid} `, element("span", { class: `state ${worker.state}` }, worker.state), worker.asked === null ? null : ` (asked to ${worker.asked === "kill" ? "end" : "drain"})`,
-    element("p", {}, ...doing), element("small", {}, "began ", time(worker.started_at), ", seen ", time(worker.seen_at))),
+    element("p", {}, ...doing), element("small")),
     element("div", { class: "actions" }, button("drain"), button("kill")));
 }
 

@@ -70,6 +70,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
 
   const room = neutralRoom();
   let map = null; // { name, ...pixels }
+  let chosen = null; // stands for the map that was chosen last, which may still come
   const view = new OrbitScene(stage, `The asset ${file.name} in 3D`, { onclick: pick, onfault: (sentence) => { fault.textContent = sentence; } });
   const { scene, renderer } = view;
   renderer.toneMapping = LinearToneMapping;
@@ -128,13 +129,18 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   }
 
   async function use(read) {
+    const mine = {};
+    chosen = mine;
+    let found;
     try {
       const { name, data } = await read();
-      map = { name, ...(await readEnvironment(data, name, DISPLAY_SPACE)) };
+      found = { name, ...(await readEnvironment(data, name, DISPLAY_SPACE)) };
     } catch (error) {
       tell(error.message);
       return;
     }
+    if (chosen !== mine) return; // another was chosen meanwhile
+    map = found;
     preview.replaceChildren(previewOf(map));
     control.lit.options[1].disabled = false;
     control.lit.options[1].textContent = `The environment map ${map.name}`;
@@ -150,6 +156,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   control.environment.addEventListener("change", () => {
     const id = control.environment.value;
     if (id !== "") return use(() => load(id));
+    chosen = null;
     if (control.lit.value === MAP) control.lit.value = ROOM;
     return light();
   });

@@ -1,6 +1,6 @@
 /** The stage at this machine: captures are planned, taken, watched, mended, and made into assets. */
 
-import { read } from "../api.js";
+import { load, read } from "../api.js";
 import { byId, show } from "../element.js";
 import { mountLive } from "./live.js";
 import { mountNext } from "./next_step.js";
@@ -12,17 +12,46 @@ import { mountSteps } from "./steps.js";
 
 const PAUSE_MS = 250;
 
-const rig = await read("/set/rig");
-byId("rig").textContent = rig.name;
-document.title = `Set: ${rig.name} · Relit`;
-show(byId("live"), rig.live);
-let state = null;
-mountForm(rig, paint);
-const showSteps = mountSteps(rig.patterns, paint);
-const showShots = mountShots(rig.lamps);
-const showLive = mountLive();
-const showNext = mountNext();
-const results = mountOutcome(rig.patterns, () => state !== null && showNext(state, results.outcome));
+/** Show the stage of a rig; return what shows its state anew. */
+function mount(rig) {
+  byId("rig").textContent = rig.name;
+  document.title = `Set: ${rig.name} · Relit`;
+  show(byId("live"), rig.live);
+  let state = null;
+  let shown = "";
+  mountForm(rig, paint);
+  const showSteps = mountSteps(rig.patterns, paint);
+  const showShots = mountShots(rig.lamps);
+  const showLive = mountLive();
+  const showNext = mountNext();
+  const results = mountOutcome(rig.patterns, () => state !== null && showNext(state, results.outcome));
+
+  function paint() {
+    if (state === null) return;
+    showShots(state);
+    showSteps(state);
+    showMeter(state);
+    byId("lines").textContent = state.lines.join("\n");
+    results.follow(state);
+    showNext(state, results.outcome);
+  }
+
+  return async () => {
+    try {
+      const { live, ...now } = await read("/set/state");
+      const text = JSON.stringify(now);
+      if (text !== shown) {
+        follow(state, now);
+        state = now;
+        paint();
+      }
+      showLive({ live, running: now.running });
+      shown = text;
+    } catch (error) {
+      byId("now").textContent = error.message;
+    }
+  };
+}
 
 /** Show the metered pictures. */
 function showMeter({ name, files }) {
@@ -34,30 +63,12 @@ function showMeter({ name, files }) {
   metered.dataset.changed = `${name} ${changed}`;
 }
 
-function paint() {
-  if (state === null) return;
-  showShots(state);
-  showSteps(state);
-  showMeter(state);
-  byId("lines").textContent = state.lines.join("\n");
-  results.follow(state);
-  showNext(state, results.outcome);
-}
-
-let shown = "";
-for (;;) {
-  try {
-    const { live, ...now } = await read("/set/state");
-    const text = JSON.stringify(now);
-    if (text !== shown) {
-      follow(state, now);
-      state = now;
-      paint();
-    }
-    showLive({ live, running: now.running });
-    shown = text;
-  } catch (error) {
-    byId("now").textContent = error.message;
-  }
+const look = await load(async () => { // until the state is here nothing can be typed that it would overwrite
+  const first = mount(await read("/set/rig"));
+  await first();
+  return first;
+});
+while (look !== undefined) {
   await new Promise((resolve) => { setTimeout(resolve, PAUSE_MS); });
+  await look();
 }

@@ -1,7 +1,7 @@
 /** The pictures of a capture as they come: in a table, on the dome of the lamps, and the one that is chosen. */
 
 import { mountLamps } from "../dome.js";
-import { byId, element, show } from "../element.js";
+import { byId, element, setChildren, show } from "../element.js";
 import { showPicture } from "./picture.js";
 import { chosenLamps, start, toggleLamp } from "./plan_form.js";
 
@@ -39,7 +39,7 @@ export function mountShots(lamps) {
   let followed = null; // the picture that was shown because it was the last one
   return (state) => {
     const rows = new Map([...body.rows].map((each) => [each.dataset.shot, each]));
-    body.replaceChildren(...state.shots.map((shot) => {
+    setChildren(body, state.shots.map((shot) => {
       const text = JSON.stringify([shot, state.name, state.running]);
       const before = rows.get(shot.shot);
       if (before?.dataset.text === text) return before;

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, done, new_context
+from tests.service.server.pages.conftest import PAGE_BYTES, await_whole, count_bytes, done, expect, new_context, seen
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -52,7 +52,8 @@ def opened(browser, server, exported):
     page.add_init_script(KEEP_CONTEXT)
     loaded = count_bytes(page)
     open_asset(page, exported["glb"])
-    assert 1_000_000 < sum(loaded) < PAGE_BYTES  # with three.js
+    seen(page, lambda: sum(loaded) > 1_000_000, "three.js is not loaded")
+    assert sum(loaded) < PAGE_BYTES
     yield page
     page.close()
     assert errors == []
@@ -71,7 +72,9 @@ def open_asset(page, job: str) -> dict:
     """Open the page of an asset, and hide the lights of the rig, which are no part of it."""
     page.goto(f"/asset/{job}")
     page.wait_for_function("() => globalThis.asset !== undefined", timeout=LOADED_MS)
+    await_whole(page)
     page.get_by_label("Lights of the rig").uncheck()
+    page.locator("canvas.scene[data-share='1']").wait_for(timeout=LOADED_MS)  # it has its size
     return page.evaluate("() => globalThis.asset.state()")
 
 
@@ -146,7 +149,8 @@ def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
                     if job["request"]["capture"] == solved.capture)
         frames = client.get(f"/v1/jobs/{view}/results/view.json").json()["frames"]
     lights = [index for index, frame in enumerate(frames) if frame["kind"] == "light" and frame["direction"] is not None]
-    assert asset.locator("select").first.locator("option").count() == 2 + len(lights) > 2
+    assert len(lights) > 0
+    expect(asset.locator("select").first.locator("option")).to_have_count(2 + len(lights))
     hidden = shown(asset)
     asset.get_by_label("Lights of the rig").check()
     assert not np.array_equal(hidden, shown(asset))
@@ -220,7 +224,7 @@ def test_a_distance_is_measured_between_two_points_of_the_object(asset):
     asset.keyboard.press("Enter")
     asset.get_by_text("Choose the other point.").wait_for()
     asset.keyboard.press("Enter")
-    assert asset.evaluate("() => globalThis.asset.state().distance") == 0  # the same point twice
+    asset.wait_for_function("() => globalThis.asset.state().distance === 0")  # the same point twice
     asset.get_by_role("button", name="Measure a distance").click()
 
 
@@ -236,9 +240,9 @@ def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor
     asset.locator("canvas.scene").focus()
     for _ in range(4):
         asset.keyboard.press("ArrowRight")
-    assert not np.array_equal(first, shown(asset))
+    seen(asset, lambda: not np.array_equal(first, shown(asset)))
     asset.keyboard.press("0")
-    assert np.array_equal(first, shown(asset))
+    seen(asset, lambda: np.array_equal(first, shown(asset)))
     asset.evaluate("""() => {
       globalThis.lost = webgl.getExtension('WEBGL_lose_context');
       lost.loseContext();
@@ -247,7 +251,7 @@ def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor
     asset.evaluate("() => { delete document.querySelector('canvas.scene').dataset.share; lost.restoreContext(); }")
     asset.locator("canvas.scene[data-share='1']").wait_for()  # without a call for a picture
     asset.get_by_text("The graphics processor has stopped").wait_for(state="detached")
-    assert np.array_equal(first, shown(asset))
+    seen(asset, lambda: np.array_equal(first, shown(asset)))
 
 
 def test_a_job_without_an_asset_that_can_be_shown_is_said_and_without_webgl_the_file_is_offered(page, exported):
@@ -256,7 +260,7 @@ def test_a_job_without_an_asset_that_can_be_shown_is_said_and_without_webgl_the_
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(f"/asset/{exported['glb']}")
     page.get_by_text("This browser has no WebGL2").wait_for()
-    assert page.get_by_role("link", name="Its job").get_attribute("href") == f"/jobs/{exported['glb']}"
+    expect(page.get_by_role("link", name="Its job")).to_have_attribute("href", f"/jobs/{exported['glb']}")
 
 
 @pytest.mark.parametrize("form", ["usdz", "glb"])

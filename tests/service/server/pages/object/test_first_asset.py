@@ -3,7 +3,7 @@
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import new_context
+from tests.service.server.pages.conftest import await_whole, expect, new_context
 from tests.service.server.pages.frames import picture
 from tests.service.server.pages.photographs import write_photographs
 
@@ -14,6 +14,12 @@ COUNT = """addEventListener("pointerdown", ({ isTrusted }) => {
   if (isTrusted) sessionStorage.presses = 1 + Number(sessionStorage.presses ?? 0);
 }, true);"""
 """Counts over all pages of the tab."""
+SEE_PROGRESS = """() => {
+  const work = document.getElementById("work");
+  globalThis.wasFollowed = false;
+  new MutationObserver(() => { wasFollowed ||= work.querySelector("progress") !== null; }).observe(work, { childList: true });
+}"""
+"""Notes whether the progress of a job was shown, which may be over before a test can look."""
 
 
 @pytest.fixture
@@ -31,10 +37,11 @@ def presses(page) -> int:
 def saved_asset(page) -> bytes:
     """Make the asset on the page of the object, which is not left meanwhile, and save it."""
     address = page.url.partition("#")[0]
+    page.evaluate(SEE_PROGRESS)
     page.get_by_role("button", name="Make an asset").click()
-    page.locator("#work progress").wait_for()
     link = page.get_by_role("link", name="Save asset.usdz")
     link.wait_for(timeout=WORK_MS)
+    assert page.evaluate("wasFollowed")
     assert page.url.partition("#")[0] == address
     with page.expect_download() as download:
         link.click()
@@ -45,7 +52,7 @@ def opened(page) -> None:
     """Open the home page, and wait until it takes folders."""
     page.goto("/")
     page.locator("#bar").wait_for()
-    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    await_whole(page)
 
 
 def drop(page, folder) -> None:
@@ -64,13 +71,13 @@ def test_a_dropped_folder_becomes_a_picture_and_an_asset_in_three_clicks(countin
     page.get_by_role("button", name="Import", exact=True).click()
     page.locator("canvas.picture[data-ready]").wait_for(timeout=WORK_MS)
     assert picture(page).std() > 0.05  # an object before the even grey
-    assert page.locator("textarea:visible").count() == 0
+    expect(page.locator("textarea:visible")).to_have_count(0)
     assert saved_asset(page)[:2] == b"PK"
     assert presses(page) == 3
-    assert page.locator("#modes button").all_inner_texts() == ["Light", "Maps", "3-D", "Photographs"]
+    expect(page.locator("#modes button")).to_have_text(["Light", "Maps", "3-D", "Photographs"])
     page.locator("#report-part > summary").click()
-    words = page.locator("#report-part > div").inner_text()
     page.get_by_text("Time taken", exact=True).wait_for()
+    words = page.locator("#report-part > div").inner_text()
     assert "{" not in words and "[object" not in words
 
 
@@ -95,7 +102,7 @@ def test_the_keyboard_alone_leads_from_a_folder_to_an_asset(counting, tmp_path):
     assert violations_in_both_schemes(page) == []  # of the open proposal
     page.keyboard.press("Enter")
     page.locator("canvas.picture[data-ready]").wait_for(timeout=WORK_MS)
-    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    await_whole(page)
     tab_to(page, "Make an asset")
     page.keyboard.press("Enter")
     page.get_by_role("link", name="Save asset.usdz").wait_for(timeout=WORK_MS)
@@ -117,10 +124,10 @@ def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting
     page.get_by_role("button", name="Import", exact=True).click()
     page.wait_for_url("**/object/cap_*", timeout=WORK_MS)
     page.locator("#next .granted", has_text="Nobody has measured").wait_for(timeout=WORK_MS)
-    assert page.locator("#modes button").all_inner_texts() == ["Photographs"]  # under lights that nobody knows nothing is relit
+    expect(page.locator("#modes button")).to_have_text(["Photographs"])  # under lights that nobody knows nothing is relit
     assert saved_asset(page)[:2] == b"PK"
     assert presses(page) == 4
-    assert page.locator("#modes button").all_inner_texts() == ["Light", "Maps", "3-D", "Photographs"]
+    expect(page.locator("#modes button")).to_have_text(["Light", "Maps", "3-D", "Photographs"])
     page.get_by_role("button", name="Light", exact=True).click()
     page.locator("canvas.picture[data-ready]").wait_for(timeout=WORK_MS)
     assert picture(page).std() > 0.05
@@ -133,5 +140,5 @@ def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting
     assert made[0]["request"]["solve"]["lights"] == "unknown" and len(report["found"]["unknown_lights"]["directions"]) == 32
     page.goto(f"/captures/{capture}")
     page.locator("#work:not([hidden])").wait_for()
-    assert page.locator("form[data-kind=solve] [data-name=lights] select").input_value() == "unknown"
-    assert page.locator("#calibrations [data-calibration=lights].missing").count() == 1
+    expect(page.locator("form[data-kind=solve] [data-name=lights] select")).to_have_value("unknown")
+    expect(page.locator("#calibrations [data-calibration=lights].missing")).to_have_count(1)

@@ -8,9 +8,16 @@ import pytest
 from stage.capture.capture import Capture
 from stage.results.maps import SurfaceMaps
 from stage.stack.correction import Correction
-from tests.service.server.pages.conftest import SAMPLES, spread_fingers
+from tests.service.server.pages.conftest import SAMPLES, expect, seen, spread_fingers
 
 pytestmark = pytest.mark.long
+
+DRAWN = """(canvas) => {
+  const pen = canvas.getContext("2d");
+  const isOpaque = (x) => pen.getImageData(canvas.width / 2 + x, canvas.height / 2, 1, 1).data[3] === 255;
+  return isOpaque(-20) && isOpaque(20) ? canvas.toDataURL() : null;
+}"""
+"""The picture of the map, or null as long as nothing is drawn beside its middle."""
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +34,10 @@ def opened(page, solved):
 
 def point_at(page, row: int, col: int, side: int) -> str:
     """Point at a pixel of the map, which is shown as a whole; return what the page says of it."""
+    page.wait_for_function("""() => {
+      const canvas = document.querySelector("canvas.map"), { width, height } = canvas.getBoundingClientRect();
+      return canvas.width === Math.round(width * devicePixelRatio) && canvas.height === Math.round(height * devicePixelRatio);
+    }""")
     box = page.locator("canvas.map").bounding_box()
     scale = min(box["width"], box["height"]) / side
     x = box["x"] + box["width"] / 2 + (col + 0.5 - side / 2) * scale
@@ -35,6 +46,12 @@ def point_at(page, row: int, col: int, side: int) -> str:
     said = page.locator("output.value")
     said.get_by_text(f"row {row}, column {col}:").wait_for()
     return said.inner_text()
+
+
+def drawn(page, *others: str) -> str:
+    """What the map shows, when its tile has come and it is none of these pictures."""
+    canvas = page.locator("canvas.map")
+    return seen(page, lambda: (found := canvas.evaluate(DRAWN)) not in (None, *others) and found, "the map is not drawn")
 
 
 def numbers(said: str, title: str) -> list[float]:
@@ -69,17 +86,13 @@ def test_what_is_less_sure_is_greyed_out(opened, maps, by, title, sign):
     opened.get_by_label("Layer", exact=True).first.select_option("normal")
     opened.get_by_label("Hatch unsure pixels").uncheck()
     opened.get_by_label("Rows and columns").uncheck()
-    opened.wait_for_function("""() => { const canvas = document.querySelector('canvas.map');
-      return canvas.getContext('2d').getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[3] === 255; }""")
+    drawn(opened)
     before = [colour(at) for at in (surest, least)]
     opened.get_by_label("Grey out by").select_option(by)
     opened.wait_for_function("(title) => document.querySelector(`canvas[aria-label^='Histogram of ${title}']`) !== null", arg=title)
     wanted = 128 + (before[1] - 128) * (1 - 235 / 255)
-    for _ in range(200):  # the tiles of the veil come one by one
-        if np.allclose(colour(least), wanted, atol=2):
-            break
-        opened.wait_for_timeout(50)
-    assert np.allclose(colour(least), wanted, atol=2) and np.allclose(colour(surest), before[0], atol=2)
+    # the tiles of the veil come one by one
+    seen(opened, lambda: np.allclose(colour(least), wanted, atol=2) and np.allclose(colour(surest), before[0], atol=2), "not greyed out")
     assert f"{title} " in point_at(opened, int(least[0]), int(least[1]), len(maps.mask))
     opened.wait_for_function("(by) => location.hash.includes(`over=${by}`)", arg=by)
 
@@ -94,6 +107,7 @@ def test_rows_and_columns_are_numbered_along_the_edges(opened):
     opened.wait_for_function(f"() => ({edge})(document.querySelector('canvas.map')) > 0")
     opened.get_by_label("Rows and columns").uncheck()
     opened.wait_for_function(f"() => ({edge})(document.querySelector('canvas.map')) === 0")
+    expect(opened.locator(".axis").first.locator("span")).to_have_count(3)
     low, middle, high = (float(each.replace("\u2212", "-")) for each in opened.locator(".axis").first.locator("span").all_inner_texts())
     assert low < middle < high and np.isclose(middle, (low + high) / 2, rtol=1e-3)
 
@@ -104,16 +118,11 @@ def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     row, col = (int(each[len(each) // 2]) for each in np.nonzero(unsure))
     assert "unsure" in point_at(opened, row, col, len(maps.mask))
 
-    def picture() -> bytes:
-        opened.wait_for_timeout(300)  # a frame, and the tiles
-        return opened.locator("canvas.map").screenshot()
-
-    with_hatching = picture()
+    with_hatching = drawn(opened)
     opened.get_by_label("Hatch unsure pixels").uncheck()
-    without = picture()
-    assert with_hatching != without
+    without = drawn(opened, with_hatching)
     opened.get_by_label("Hatch unsure pixels").check()
-    assert picture() == with_hatching
+    assert drawn(opened, without) == with_hatching
 
 
 def test_the_map_is_moved_by_keys(opened, maps):
@@ -136,20 +145,16 @@ def test_the_map_is_moved_by_keys(opened, maps):
 def test_two_layers_are_wiped_and_the_range_of_the_histogram_changes_the_picture(opened):
     opened.get_by_label("Compare with", exact=True).first.select_option("height")
     wipe = opened.get_by_label("Where the two layers meet")
-    pictures = set()
+    pictures: list[str] = []
     for value in ("0", "50", "100"):
         wipe.fill(value)
-        opened.wait_for_timeout(300)
-        pictures.add(opened.locator("canvas.map").screenshot())
-    assert len(pictures) == 3
+        pictures.append(drawn(opened, *pictures))
     said = point_at(opened, 64, 64, 128)
     assert "Normals" in said and "Height" in said
     opened.get_by_label("Layer", exact=True).first.select_option("height")
-    opened.wait_for_timeout(500)
-    before = opened.locator("canvas.map").screenshot()
+    before = drawn(opened, *pictures)
     opened.get_by_label("Lowest value that is shown").fill("600")
-    opened.wait_for_timeout(500)
-    assert opened.locator("canvas.map").screenshot() != before
+    drawn(opened, before)
 
 
 def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
@@ -161,9 +166,10 @@ def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
     opened.get_by_role("heading", name=f"Row {row}, column {col}").wait_for()
     capture = Capture.open(SAMPLES / "lambert")
     frames = capture.manifest.frames
-    assert opened.locator("svg.plot circle.measured").count() == 3 * len(frames)
-    assert opened.locator("svg.plot polyline.model").count() == 3
+    expect(opened.locator("svg.plot circle.measured")).to_have_count(3 * len(frames))
+    expect(opened.locator("svg.plot polyline.model")).to_have_count(3)
     opened.locator("summary", has_text="The numbers").click()
+    expect(opened.locator("section table tbody tr").last).to_be_visible()
     rows = [each.split("\t") for each in opened.locator("section table tbody tr").all_inner_texts()]
     assert [each[0] for each in rows] == [frame.image for frame in frames]
     readings = np.array([[float(value) for value in each[2].split(",")] for each in rows])
@@ -176,15 +182,13 @@ def test_every_map_of_the_capture_is_shown(opened):
     layers = opened.get_by_label("Layer", exact=True).first
     names = layers.locator("option").evaluate_all("all => all.map(each => each.value)")
     assert {"normal", "diffuse_albedo", "height", "confidence", "status", "mask"} <= set(names)
-    pictures = set()
+    pictures: list[str] = []
     for name in names:
         layers.select_option(name)
-        opened.wait_for_timeout(400)
-        assert opened.locator(".histogram canvas, .histogram li").first.is_visible()
+        pictures.append(drawn(opened, *pictures))  # each is another
+        expect(opened.locator(".histogram canvas, .histogram li").first).to_be_visible()
         assert "row 64, column 64" in point_at(opened, 64, 64, 128)
         opened.mouse.move(5, 5)
-        pictures.add(opened.locator("canvas.map").screenshot())
-    assert len(pictures) == len(names)
 
 
 def test_a_link_shows_the_part_of_a_map_that_its_sender_saw_and_fingers_zoom_it(page, solved):
@@ -196,7 +200,8 @@ def test_a_link_shows_the_part_of_a_map_that_its_sender_saw_and_fingers_zoom_it(
     page.keyboard.press("ArrowLeft")
     page.wait_for_function("() => location.hash.includes('map-centre=') && !location.hash.includes('map-centre=64')")
     read = "() => document.querySelector('.value').textContent.split(':')[0]"
-    page.wait_for_function("() => document.querySelector('.value').textContent.startsWith('row')")
+    column = "Math.floor(location.hash.match(/map-centre=([\\d.]+)/)[1])"  # of the middle, and no longer that of a finger
+    page.wait_for_function(f"() => document.querySelector('.value').textContent.includes(`column ${{{column}}}:`)")
     before = page.evaluate(read)
     page.reload()
     solved.wait_for_content(page, "maps")

@@ -11,7 +11,7 @@ from service.server.database import jobs
 from stage.formats import exr
 from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import SAMPLES, done, new_context
+from tests.service.server.pages.conftest import SAMPLES, await_whole, done, expect, new_context
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -51,7 +51,7 @@ def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsur
     pictures = []
     for name in ("depth", "confidence", "photograph"):
         cloud.get_by_label("Colour by").select_option(name)
-        assert cloud.evaluate("() => globalThis.cloud.state()")["by"] == name
+        cloud.wait_for_function("(name) => globalThis.cloud.state().by === name", arg=name)
         pictures.append(picture(cloud))
     assert (pictures[0][:, 3] > 0).mean() > 0.1
     for other in pictures[1:]:
@@ -60,17 +60,19 @@ def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsur
     with server.client() as client:
         points = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["points"]
     assert points["unsure"] > 0
-    assert cloud.evaluate("() => globalThis.cloud.state()")["shown"] == points["count"] + points["unsure"]
+    shown = "(count) => globalThis.cloud.state().shown === count"
+    cloud.wait_for_function(shown, arg=points["count"] + points["unsure"])
     cloud.get_by_label("Show unsure points").uncheck()
-    assert cloud.evaluate("() => globalThis.cloud.state()")["shown"] == points["count"]
+    cloud.wait_for_function(shown, arg=points["count"])
 
 
 def test_a_chosen_point_is_one_of_the_depth(cloud, server, depth, tmp_path):
     """The point in the middle, read by the keyboard, lies where depth.exr has it."""
     cloud.locator("canvas.scene").focus()
     cloud.keyboard.press("Enter")
-    text = cloud.locator("output", has_text="camera frame").inner_text().replace("−", "-")
-    x, y, z, away = (float(value) for value in re.search(r"x (\S+), y (\S+), z (\S+) m .*?depth (\S+) m", text).groups())
+    chosen, numbers = cloud.locator("output", has_text="camera frame"), re.compile(r"x (\S+), y (\S+), z (\S+) m .*?depth (\S+) m")
+    expect(chosen).to_have_text(numbers)
+    x, y, z, away = (float(value) for value in numbers.search(chosen.inner_text().replace("−", "-")).groups())
     assert away == -z
     with server.client() as client:
         path = tmp_path / "depth.exr"
@@ -90,14 +92,15 @@ def test_without_webgl_the_maps_remain(page, depth):
         };""")
     page.goto(f"/maps/{depth[0]}")
     page.get_by_text("This browser has no WebGL2, which the points need").wait_for(timeout=LOADED_MS)
-    assert page.locator("canvas.map").is_visible()
+    expect(page.locator("canvas.map")).to_be_visible()
 
 
 def test_no_violation(browser, server, depth):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
     page.goto(f"/maps/{depth[0]}")
     page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    await_whole(page)
+    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
     assert violations(page) == []
     page.close()
 
@@ -124,3 +127,6 @@ def test_other_scans_are_chosen_to_be_fused(page, server, depth):
         assert made["request"]["kind"] == "register" and made["request"]["depths"] == [depth[0], other]
         page.locator(f"a[href='/jobs/{made['id']}']").first.wait_for()
         client.post(f"/v1/jobs/{made['id']}/cancel")
+        server.wait(client, f"/v1/jobs/{made['id']}", ("cancelled", "failed"))
+        for each in (made["id"], other):  # other tests share the server
+            client.delete(f"/v1/jobs/{each}").raise_for_status()

@@ -5,7 +5,7 @@ import pytest
 from tests.scenes.sequence import write_sequence
 from tests.service.server.api.test_measuring import files_of, upload
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import CONTENT_MS, done, new_context
+from tests.service.server.pages.conftest import CONTENT_MS, await_whole, done, expect, new_context
 
 pytestmark = pytest.mark.long
 
@@ -26,23 +26,25 @@ def test_the_maps_and_the_frames_of_each_step_are_looked_at(page, walk):
     page.goto(f"/jobs/{walk[1]}")
     page.get_by_role("link", name="Look at the maps").click()
     page.get_by_role("heading", name="Maps of step00", level=1).wait_for(timeout=CONTENT_MS)
-    assert page.get_by_label("Time step").locator("option").all_inner_texts() == [
-        f"step{step:02d} ({step + 1} of {STEPS})" for step in range(STEPS)]
-    assert page.get_by_role("button", name="Step before").is_disabled()
+    steps = [f"step{step:02d} ({step + 1} of {STEPS})" for step in range(STEPS)]
+    expect(page.get_by_label("Time step").locator("option")).to_have_text(steps)
+    expect(page.get_by_role("button", name="Step before")).to_be_disabled()
     page.get_by_label("Time step").select_option("2")
     page.get_by_role("heading", name="Maps of step01", level=1).wait_for(timeout=CONTENT_MS)
-    assert page.url.endswith("?step=2")
+    page.wait_for_url("**?step=2")
     page.get_by_role("button", name="Step after").click()
     page.get_by_role("heading", name="Maps of step02", level=1).wait_for(timeout=CONTENT_MS)
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
-    assert page.get_by_role("button", name="Step after").is_disabled()
+    expect(page.get_by_role("button", name="Step after")).to_be_disabled()
     page.goto(f"/captures/{walk[0]}?step=2")
     page.locator("#frames canvas").first.wait_for(timeout=CONTENT_MS)
-    assert page.get_by_label("Time step").input_value() == "2"
-    assert page.get_by_role("link", name="Light it").is_hidden()
+    await_whole(page)
+    expect(page.get_by_label("Time step")).to_have_value("2")
+    expect(page.get_by_role("link", name="Light it")).to_be_hidden()
     page.goto(f"/jobs/{walk[1]}")
     page.locator("#results a").first.wait_for(timeout=CONTENT_MS)
-    assert page.get_by_role("link", name="Light the capture").is_hidden()
+    await_whole(page)
+    expect(page.get_by_role("link", name="Light the capture")).to_be_hidden()
     page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)
 
 
@@ -51,5 +53,6 @@ def test_the_choice_of_a_step_has_no_violation(browser, server, walk):
     page.goto(f"/jobs/{walk[1]}")
     page.get_by_role("link", name="Look at the maps").click()
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
+    await_whole(page)
     assert violations(page) == []
     page.close()

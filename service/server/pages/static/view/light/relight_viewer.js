@@ -63,6 +63,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
   const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
   let map = null; // { id, name, profile }
+  let chosen = null; // stands for the environment that was chosen last, which may still come
   let asked = false;
   const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
   const loop = new DrawLoop(renderer, show);
@@ -150,23 +151,30 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     return model.sum(key, map === null ? null : model.turned(map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure));
   }
 
-  async function useEnvironment(id, name, data) {
+  /** Use an environment, and return whether it is still the one that is wanted when it has been read. */
+  async function useEnvironment(id, name, data, isWanted = () => true) {
     const found = await readEnvironment(data, name, view.info.color_space);
+    if (!isWanted()) return false;
     map = { id, name, profile: new EnvironmentProfile(found, model.rows) };
     preview.replaceChildren(previewOf(found));
     change();
+    return true;
   }
 
   /** Show an environment alone at first, exposed for it; the key light comes back when it is moved or switched on. */
-  async function chooseEnvironment(id, name, data) {
+  async function chooseEnvironment(id, file) {
+    const mine = {};
+    chosen = mine;
+    const { name, data } = await file();
     const isFirst = map === null;
-    await useEnvironment(id, name, data);
+    if (!(await useEnvironment(id, name, data, () => chosen === mine))) return; // another was chosen while it was loaded
     if (isFirst) control.lit.checked = false;
     expose();
     change();
   }
 
   function dropEnvironment() {
+    chosen = null;
     control.lit.checked = true;
     map = null;
     preview.replaceChildren();
@@ -193,20 +201,20 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   control.environment.addEventListener("change", () => attemptHere(async () => {
     const id = control.environment.value;
     if (id === "") dropEnvironment();
-    else {
-      const { name, data } = await load(id);
-      await chooseEnvironment(id, name, data);
-    }
+    else await chooseEnvironment(id, () => load(id));
   }));
   control.file.addEventListener("change", () => attemptHere(async () => {
     const [file] = control.file.files;
     if (file === undefined) return;
     control.environment.value = "";
-    await chooseEnvironment(null, file.name, await file.arrayBuffer());
+    await chooseEnvironment(null, async () => ({ name: file.name, data: await file.arrayBuffer() }));
   }));
 
   async function useView() {
-    renderer.setView(await viewTable(control.view.value));
+    const wanted = control.view.value;
+    const table = await viewTable(wanted);
+    if (control.view.value !== wanted) return; // another was chosen meanwhile
+    renderer.setView(table);
     change();
   }
 

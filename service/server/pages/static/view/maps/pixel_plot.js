@@ -26,14 +26,18 @@ export function mount(parent, view) {
   const place = element("div", {}, element("p", { class: "help" }, "Choose a pixel of the map: click it, or press Enter."));
   parent.replaceChildren(element("label", {}, "Order by ", order), place);
   let shown = null;
+  let asked = null; // the pixel that was chosen last, whose readings may still come
   order.addEventListener("change", () => shown !== null && present(shown));
 
   async function show(row, col) {
+    const mine = { row, col };
+    asked = mine;
     const at = Math.min(Math.floor(row / samples.step), samples.rows - 1) * samples.cols + Math.min(Math.floor(col / samples.step), samples.cols - 1);
     const size = samples.lights * BYTES;
     const read = async (offset, bytes) => (offset === null ? null : view.raw(offset + at * bytes, bytes));
     const [measured, model, used, normal] = await Promise.all([read(samples.measured, size), read(samples.model, size),
       read(samples.used ?? null, samples.lights), view.layer("normal") === undefined ? null : view.pixel(view.layer("normal"), row, col)]);
+    if (mine !== asked) return;
     const radiance = (block) => floats(block, "float16").map((value) => samples.scale * value);
     shown = { row, col, measured: radiance(measured), model: model === null ? null : radiance(model),
       used: used === null ? null : new Uint8Array(used), normal };
