@@ -1,8 +1,8 @@
 """relit publish --as iiif: what IIIF's own validators find.
 
 That of the Image API runs its tests of level 0 against a server of files. That of the Presentation API is in no registry: iiif-prezi3 has
-models of its schema, and the schema is read where RELIT_TEST_IIIF_SCHEMA names its file (schema/iiif_3_0.json of IIIF/presentation-validator).
-What the models do not ask and the validator does is asked here, in words of our own.
+models of its schema, and the schema, schema/iiif_3_0.json of IIIF/presentation-validator, is read where RELIT_TEST_IIIF_SCHEMA names the
+file. What the models do not ask and the validator does is asked here, in words of our own.
 """
 
 import json

@@ -42,7 +42,7 @@ def test_captured_lights_show_the_captured_images(relit, tmp_path):
 @pytest.mark.long
 @pytest.mark.parametrize("owl", [False, True])
 def test_each_light_is_shown_as_the_basis_has_it(relit, tmp_path, owl):
-    """32 lights of a hemisphere, and the sample's 47: OpenLIME shows each within 2 levels of the components before they are bytes and JPEG."""
+    """The dome's 32 lights and the sample's 47: OpenLIME shows each within 2 levels of the components before bytes and JPEG files."""
     folder = SAMPLES / "owl" if owl else tmp_path / "dome"
     lights, truth = sample(folder) if owl else dome(folder)
     relit.done("publish", folder, "--to", tmp_path / "out", "--as", "openlime")
