@@ -34,6 +34,7 @@ from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
 from benchmarks.spin import spin_table
 from benchmarks.structured import structured_rows
+from benchmarks.studio import studio_rows
 from benchmarks.tof import rows as tof_rows
 from benchmarks.tof_accuracy import accuracy_rows
 from benchmarks.tof_bound import bound_rows
@@ -216,6 +217,11 @@ def set_times(_: argparse.Namespace) -> list[str]:
     return time_table()
 
 
+def studio(_: argparse.Namespace) -> list[str]:
+    """Measure charts and published planes."""
+    return studio_rows()
+
+
 SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
@@ -239,6 +245,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "memory": ("Memory", memory),
     "set_faults": ("Faults of captures", set_faults),
     "set_times": ("Time of captures", set_times),
+    "studio": ("Charts and publications", studio),
 }
 INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\n"
                 "Written by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "

@@ -27,6 +27,8 @@ DEEP_ZOOM = ('<?xml version="1.0" encoding="UTF-8"?>\n<Image xmlns="http://schem
              'TileSize="{tile}"><Size Width="{width}" Height="{height}"/></Image>\n')
 RESERVE = 1.05
 """How far the range of a plane goes beyond that of the sampled pixels."""
+FINER_IMAGES = 5
+"""Number of images, the first, whose planes count more in pictures than those of the others, and are kept at a higher quality."""
 
 
 def write_planes(folder: Path, source: BasisCapture, display: Display, sample: np.ndarray, device: str, timings: Timings, *, quality: int,
@@ -49,7 +51,7 @@ def write_planes(folder: Path, source: BasisCapture, display: Display, sample: n
     weights[:, :, display.front] = fit.swapaxes(1, 2)
     camera = source.capture.camera
     images, levels = len(fit) // 3, 1 + halvings(camera.width, camera.height, TILE)
-    pyramids = [Pyramid(camera.width, camera.height, _tile(folder, image, levels), levels=levels, quality=quality,
+    pyramids = [Pyramid(camera.width, camera.height, _tile(folder, image, levels), levels=levels, quality=_quality_of(image, quality),
                         whole=folder / f"plane_{image}.jpg" if whole else None) for image in range(images)]
     bytes_per_pixel = 6 * source.stack.shape[1] + 20 * len(fit)  # display values, and planes in their stages
     with Strips(camera.height, camera.width, pyramids, quantization.zero.astype(np.uint8).reshape(-1, 3)) as strips:
@@ -74,6 +76,11 @@ def _info(source: BasisCapture, found: Components) -> dict[str, object]:
             "nplanes": len(found.stored), "format": "jpg", "width": camera.width, "height": camera.height, **size,
             "lights": numbers(found.directions.ravel()),
             "basis": np.concatenate([black, found.stored]).ravel().tolist()}
+
+
+def _quality_of(image: int, quality: int) -> int:
+    """Return the quality of an image: 100 for the first, and `quality` after the finer ones."""
+    return 100 - round((100 - quality) * min(1.0, image / FINER_IMAGES))
 
 
 def _tile(folder: Path, image: int, levels: int) -> TilePath:

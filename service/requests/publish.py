@@ -49,7 +49,7 @@ class PublishRequest(StackOptions, Request):
     photographs: NotNegativeCount | None = None
     """iiif: most photographs, spread over the lights in their order; None: 8."""
     quality: Annotated[int, Field(ge=1, le=100)] = 98
-    """Quality of the JPEG files."""
+    """Quality of the JPEG files; of planes, the first of which count most and are kept at up to 100, that of the last."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

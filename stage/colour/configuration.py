@@ -53,6 +53,8 @@ class Configuration(NamedTuple):
     """The views of each display; the default display and its default view come first."""
     looks: tuple[str, ...]
     """The names of the looks."""
+    roles: tuple[str, ...]
+    """The names of the roles, in small letters."""
     label: str
     """The name, and the version of the library or the SHA-256 of the files: results carry it."""
 
@@ -134,7 +136,10 @@ class Configuration(NamedTuple):
         if self.location != STUDIO and not self._alike(name) and (there := studio.find(name) or next(iter(studio._alike(name)), None)):
             return f"{STUDIO} has {there}: give --ocio {STUDIO}, or set ${VARIABLE} to it"
         close = get_close_matches(name.lower(), self.names, 2 * NEAREST, 0.4)
-        near = list(dict.fromkeys([*self._alike(name), *(self.names[alias] for alias in close)]))[:NEAREST]
+        by_space = dict.fromkeys(self._alike(name), "")
+        for alias in close:
+            by_space.setdefault(self.names[alias], alias if alias in self.roles else "")
+        near = [f"{role} ({space})" if role else space for space, role in by_space.items()][:NEAREST]
         if near:
             return f"the nearest {'is' if len(near) == 1 else 'are'} {', '.join(near)}"
         return f"it has {', '.join(self.linear[:NEAREST])} and others"
@@ -228,7 +233,8 @@ def _read(place: str, changed: int) -> Configuration:
         raise ColourError(f"--ocio or ${VARIABLE}: {place}: is no OpenColorIO configuration that can be read: {reason.rstrip('.')}")
     spaces = config.getColorSpaceNames()
     names = {alias.lower(): name for name in spaces for alias in config.getAliases(name)}
-    names |= {role.lower(): str(config.getColorSpaceNameByRole(role)) for role in config.getRoles()}
+    roles = {role.lower(): str(config.getColorSpaceNameByRole(role)) for role in config.getRoles()}
+    names |= roles
     names |= {name.lower(): name for name in spaces}
     displays = sorted(config.getDisplayNames(), key=lambda display: display != config.getDefaultDisplayName())
     views = {display: tuple(sorted(config.getViewNames(display), key=lambda view: view != config.getDefaultViewName(display)))
@@ -239,7 +245,7 @@ def _read(place: str, changed: int) -> Configuration:
         label = f"{place} OpenColorIO {oiio.get_string_attribute('opencolorio_version')}"
     else:
         label = f"{Path(place).name.replace(' ', '_')} sha256:{_digest(Path(place))}"
-    return Configuration(place, names, linear, data, views, tuple(config.getLookNames()), label)
+    return Configuration(place, names, linear, data, views, tuple(config.getLookNames()), tuple(roles), label)
 
 
 def _digest(path: Path) -> str:

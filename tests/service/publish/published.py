@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from tests.reference.light_basis import srgb
-from tests.scenes.captures import make_scene, render, write_capture
+from tests.scenes.captures import make_scene, render, rgb, write_capture
 
 SIZE = 300
 """Rows and columns of the dome: more than a tile, and no power of two."""
@@ -54,18 +54,32 @@ def dome(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Write a capture of a cap under 32 white lights over the hemisphere.
 
     Returns:
-        Directions of the lights [32, 3], and [32, rows, cols, 3] what 27 components have of its pictures, before bytes and JPEG files.
+        Directions of the lights [32, 3], and of_components of its pictures.
     """
     scene, lights = make_scene(size=SIZE), spiral(32)
     white = np.ones_like(lights)
     scene = scene._replace(directions=lights, irradiance=white, images=render(scene.normal, scene.albedo, lights, white))
     write_capture(folder, scene)
-    exposure = np.quantile(scene.images[:, scene.mask], 0.999)
-    values = srgb(np.clip(scene.images / exposure, 0, 1))[:, scene.mask].swapaxes(1, 2).reshape(32 * 3, -1)
+    return lights, of_components(scene.images, scene.mask)
+
+
+def sample(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions [n, 3] of the lights in front of the object of a shipped sample, and of_components of its pictures."""
+    manifest = json.loads((folder / "capture.json").read_text())
+    frames = [frame for frame in manifest["frames"] if frame["light"]["direction"][2] > 0]
+    lights = np.array([frame["light"]["direction"] for frame in frames])
+    images = np.array([rgb(folder / frame["image"]) / frame["light"]["irradiance"] for frame in frames])
+    return lights, of_components(images, image(folder / manifest["mask"])[..., 0] > 127)
+
+
+def of_components(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[n, rows, cols, 3] what 27 components have of pictures in linear Rec.709, before bytes and JPEG files."""
+    inside = images[:, mask]
+    values = srgb(np.clip(inside / np.quantile(inside, 0.999), 0, 1)).swapaxes(1, 2).reshape(3 * len(images), -1)
     best = np.linalg.eigh(values @ values.T).eigenvectors[:, -27:]
-    pictures = np.zeros((32, SIZE, SIZE, 3))
-    pictures[:, scene.mask] = np.clip(best @ (best.T @ values), 0, 1).reshape(32, 3, -1).swapaxes(1, 2)
-    return lights, pictures
+    pictures = np.zeros(images.shape)
+    pictures[:, mask] = np.clip(best @ (best.T @ values), 0, 1).reshape(len(images), 3, -1).swapaxes(1, 2)
+    return pictures
 
 
 def levels_rms(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -1,10 +1,12 @@
 """relit publish --as iiif: what IIIF's own validators find.
 
 That of the Image API runs its tests of level 0 against a server of files. That of the Presentation API is in no registry: iiif-prezi3 has
-models of its schema. What these do not ask and the validator does is asked here, in words of our own.
+models of its schema, and the schema, schema/iiif_3_0.json of IIIF/presentation-validator, is read where RELIT_TEST_IIIF_SCHEMA names the
+file. What the models do not ask and the validator does is asked here, in words of our own.
 """
 
 import json
+import os
 
 import iiif_prezi3
 import jsonschema
@@ -44,7 +46,9 @@ def test_the_image_validator_finds_nothing(relit, tmp_path):
             assert outcome.exception is None and outcome.tests, f"{name}: {outcome.exception}"
 
 
-def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):
+@pytest.fixture
+def manifest(relit, tmp_path):
+    """A manifest that has all that manifests of Relit can hold."""
     write_capture(tmp_path / "cap", make_scene(size=64, lights=5), camera={
         "projection": "orthographic", "resolution": [64, 64], "pixel_size_m": 1e-4})
     relit.done("solve", tmp_path / "cap", "--out", tmp_path / "maps", "--method", "lambert")
@@ -52,7 +56,10 @@ def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):
     relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "iiif", "--url", "https://museum.org/cap",
                "--maps", tmp_path / "maps", "--annotations", tmp_path / "notes.json", "--attribution", "A museum",
                "--rights", "https://creativecommons.org/licenses/by/4.0/")
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    return json.loads((tmp_path / "out" / "manifest.json").read_text())
+
+
+def test_the_models_of_presentation_find_nothing(manifest):
     read = iiif_prezi3.Manifest.model_validate(manifest)
     assert [len(canvas.items[0].items[0].body.items) for canvas in read.items] == [9, 2]
     assert len(read.items[0].annotations[0].items) == 2
@@ -66,4 +73,15 @@ def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):
     schema = jsonschema.Draft202012Validator(iiif_prezi3.Manifest.model_json_schema())
     assert [error.message for error in schema.iter_errors(manifest)] == []
     for fault in ({"items": [{"type": "Canvas"}]}, {"label": "of no language"}, {"type": "Collection"}, {"id": 3}):
+        assert list(schema.iter_errors(manifest | fault))
+
+
+@pytest.mark.skipif("RELIT_TEST_IIIF_SCHEMA" not in os.environ, reason="RELIT_TEST_IIIF_SCHEMA names no file")
+def test_the_schema_of_the_presentation_validator_finds_nothing(manifest):
+    with open(os.environ["RELIT_TEST_IIIF_SCHEMA"]) as file:
+        schema = jsonschema.Draft7Validator(json.load(file))
+    assert [error.message for error in schema.iter_errors(manifest)] == []
+    canvas = manifest["items"][0]
+    for fault in ({"rights": "https://creativecommons.org/licenses/by/4.0/"}, {"more": 1}, {"items": [canvas | {"width": 0}]},
+                  {"items": [canvas | {"annotations": [{"id": "https://museum.org/page"}]}]}):
         assert list(schema.iter_errors(manifest | fault))

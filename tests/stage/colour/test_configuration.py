@@ -189,6 +189,7 @@ def test_files_declare_a_space_by_its_identifier(monkeypatch, tmp_path):
     (STUDIO, "LogC4", "the nearest are ARRI LogC4"),
     (STUDIO, "SLog3", "the nearest are S-Log3 S-Gamut3, S-Log3 S-Gamut3.Cine"),
     (STUDIO, "ACESgc", "the nearest are ACEScg"),
+    (STUDIO, "scene_liner", r"the nearest are scene_linear \(ACEScg\)"),
     (STUDIO, "Raw", "Raw holds data"),
     ("ocio://nothing", "ACEScg", "--ocio or \\$OCIO: ocio://nothing: .*nothing"),
     ("/no/such.ocio", "ACEScg", "/no/such.ocio: no such OpenColorIO configuration"),
