@@ -1,5 +1,6 @@
 """The page of relit publish --as web in a browser, from a server of files that knows nothing of Relit."""
 
+import re
 from pathlib import Path
 
 import cv2
