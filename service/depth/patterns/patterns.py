@@ -16,7 +16,7 @@ from service.depth.base.triangulation_check import check_projector, missing_cali
 from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, doubt_coordinates, doubt_pixels
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
-from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
+from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
 from service.depth.patterns.lag import widen_lagging
@@ -269,7 +269,8 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              amplitude=coordinates.amplitude, facts=facts)
     solution.warnings += lagging
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
-    if u is not None and v is not None and (found := contradicted(solution, u, v, capture.camera, projector, refined=refined > 0)) is not None:
+    found = None if u is None or v is None else contradicted(solution, u, v, capture.camera, projector, refined=refined > 0)
+    if found is not None:
         if request.refine_projector and declared and refined < REFINEMENTS:
             return _bands(planes, mask, codes, coordinates, found[0].projector, capture, noise, device, request, timings, declared=declared,
                           refined=refined + 1)

@@ -151,7 +151,7 @@ def test_a_projector_is_refined(relit, tmp_path, wrong):
     depth = written(tmp_path, wrong)
     errors = {}
     for name, words in (("declared", []), ("refined", ["--refine-projector"])):
-        relit("depth", tmp_path, "--out", tmp_path / name, "--device", "cpu", "--read-noise", "0.003", "--least-confidence", "0", *words).well()
+        relit("depth", tmp_path, "--out", tmp_path / name, "--device", "cpu", "--least-confidence", "0", *words).well()
         maps = DepthMaps.read(tmp_path / name / "depth.exr")
         error = np.abs(maps.depth - depth)[maps.mask]
         errors[name], error = float(np.median(error)), error / maps.sigma[maps.mask]
