@@ -80,8 +80,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
         turn = np.eye(4)
         turn[:3, :3] = _turn(0, 2, yaw) @ _turn(1, 0, roll)
         rig = World(shapes=SHELF).rig
-        yield _run(f"phase 16/18/21, both axes{name}", not name, World(shapes=SHELF), PHASE_BOTH, light,
-                   camera_from_projector=(rig.pose @ turn).tolist(), focal_px=[rig.projector_focal * zoom] * 2)
+        for refined in (False, True) if name else (False,):
+            yield _run(f"phase 16/18/21, both axes{name}{', refined' if refined else ''}", not name, World(shapes=SHELF), PHASE_BOTH, light,
+                       refined=refined, camera_from_projector=(rig.pose @ turn).tolist(), focal_px=[rig.projector_focal * zoom] * 2)
     for name, (patterns, change) in wrong().items():
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
     yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), ONE, light)
@@ -125,7 +126,7 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
 
 
 def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,
-         declared: Sequence[Pattern] | None = None, **projector: object) -> Trial:
+         declared: Sequence[Pattern] | None = None, *, refined: bool = False, **projector: object) -> Trial:
     """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth."""
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
@@ -134,7 +135,7 @@ def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], l
         known = light.lit & np.isfinite(light.depth)
         try:
             found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=world.read_noise,
-                                       photon_gain=1 / world.electrons))
+                                       photon_gain=1 / world.electrons, refine_projector=refined))
         except StageError as error:
             nothing = np.zeros(int(known.sum()))
             return Trial(name, in_model, nothing, nothing, nothing, nothing > 0, "mm", str(error).split(": ", 1)[-1])

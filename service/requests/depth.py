@@ -85,6 +85,9 @@ class DepthOptions(PixelOptions):
     triangulated point."""
     refine: bool = True
     """Interpolate a Gray code with inverses between the edges of its stripes."""
+    refine_projector: bool = False
+    """Where columns and rows contradict the pose and the focal length of the projector, turn and zoom it so that they do not; the report
+    says by how much. Needs patterns of both axes."""
     read_noise: Positive = 0.003
     """Standard deviation of a reading in the dark, quantisation included, as a fraction of full scale; patterns and stereo only."""
     photon_gain: NotNegative = 1e-4

@@ -167,11 +167,20 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         with replacing(destination / name) as temporary:
             temporary.write_bytes(content)
     path = destination / FILE_NAME
-    if path.is_file() and (before := inputs.read_bytes(path)) != manifest_text(manifest).encode():
+    if path.is_file() and not _made_again(before := inputs.read_bytes(path), manifest):
         with replacing(destination / PREVIOUS_NAME) as temporary:
             temporary.write_bytes(before)
     write_manifest(manifest, path)
     return path
+
+
+def _made_again(before: bytes, manifest: Manifest) -> bool:
+    """Return whether a capture.json is that of this manifest, whatever was recorded as assumed after it was written."""
+    try:
+        assumed = Manifest.model_validate_json(before).assumed
+    except ValidationError:
+        return False
+    return before == manifest_text(manifest.model_copy(update={"assumed": assumed})).encode()
 
 
 def _npy(array: np.ndarray) -> bytes:

@@ -71,6 +71,10 @@ def _find_charuco(shown: np.ndarray, board: tuple[int, int], charuco: Charuco) -
         if seen[most] >= LEAST_MARKERS:
             return f"{said} and {seen[most]} of {most}: give --markers {most}"
         return f"{said}, fewer than {LEAST_MARKERS}"
+    centres = found.mean(axis=1)
+    spread = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1] / len(centres)**0.5
+    if spread < PLACE_OF_SQUARE * np.median(np.linalg.norm(found[:, 0] - found[:, 1], axis=1)):
+        return f"the {len(numbers)} markers that are seen lie in one line, which places no board: show two rows of them or more"
     # OpenCV before 4.6 began boards of an even count of rows with a white square
     layouts = [_layout(board, charuco, legacy) for legacy in (False, True)]
     placed = [_placed(found, numbers, layout) for layout in layouts]

@@ -16,9 +16,9 @@ from service.depth.base.triangulation_check import check_projector, missing_cali
 from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, doubt_coordinates, doubt_pixels
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
-from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
+from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
-from service.depth.patterns.epipolar import contradiction
+from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.moved import SAID, EvenSums
@@ -91,6 +91,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     frames, series = frames_shown(capture)
     shown = pattern_projector(capture, frames)
     codes = read_codes(capture, frames, shown, refine=request.refine)
+    if request.refine_projector and (codes.columns is None or codes.rows is None):
+        raise RequestError("--refine-projector: needs patterns of columns and rows, and the frames have a code of one axis alone")
     joined = None
     if series is not None:
         timings.stage("exposures", len(frames))
@@ -141,7 +143,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
 
 def _refuse_depth_options(request: DepthRequest, missing: str) -> None:
     """Refuse options that say something about depths where there will be none."""
-    for option in ("near_m", "far_m", "max_sigma", "normals"):
+    for option in ("near_m", "far_m", "max_sigma", "normals", "refine_projector"):
         if getattr(request, option) not in (None, False):
             raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
 
@@ -222,9 +224,9 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
 
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
            noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
-           declared: bool) -> tuple[DepthSolution, np.ndarray]:
+           declared: bool, refined: int = 0) -> tuple[DepthSolution, np.ndarray]:
     """Return the depth of each pixel and its probability to be right; fill the coordinates.
-    `declared`: whether the frames are what the manifest declares, as far as a sample has told."""
+    `declared`: whether the frames are what the manifest declares, as far as a sample has told. `refined`: how often the projector was."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
@@ -267,24 +269,13 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              amplitude=coordinates.amplitude, facts=facts)
     solution.warnings += lagging
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
-    if u is not None and v is not None:
-        _widen(solution, u, v, capture, projector)
+    found = None if u is None or v is None else contradicted(solution, u, v, capture.camera, projector, refined=refined > 0)
+    if found is not None:
+        if request.refine_projector and declared and refined < REFINEMENTS:
+            return _bands(planes, mask, codes, coordinates, found[0].projector, capture, noise, device, request, timings, declared=declared,
+                          refined=refined + 1)
+        widen(solution, *found, check_projector(capture), refined=refined > 0)
     return solution, right
-
-
-def _widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, capture: Capture, projector: Projector) -> None:
-    """Add to σ by how much depths may be off where columns and rows contradict the calibration, and say so."""
-    solved = np.isin(solution.status, SOLVED)
-    judged = solved & u.solved & v.solved
-    points = capture.camera.points(-solution.depth)
-    found = contradiction(projector, points[judged], np.stack([u.coordinate[judged], v.coordinate[judged]], axis=1),
-                          np.stack([u.sigma[judged], v.sigma[judged]], axis=1))
-    if found is not None and solution.sigma is not None:
-        more = np.where(solved, float(np.median(found.sigma)), 0.0)
-        more[judged] = found.sigma
-        solution.sigma[:] = np.hypot(solution.sigma, more)
-        solution.facts["contradiction_px"] = float(f"{found.size_px:.3g}")
-        solution.warnings.append(found.sentence())
 
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,

@@ -151,8 +151,10 @@ def test_auto_imports_what_is_sure_and_nothing_else(relit, tmp_path, layout):
         assert f"relit import {layout} {folder}" in relit.refused("import", "auto", folder, tmp_path / "capture")
         assert not (tmp_path / "capture").exists()
         return
-    relit.done("import", "auto", folder, tmp_path / "capture")
+    for _ in range(2):
+        relit.done("import", "auto", folder, tmp_path / "capture")
     assert Capture.open(tmp_path / "capture").manifest.frames and not (folder / "capture.json").exists()
+    assert not (tmp_path / "capture" / "capture.previous.json").exists()  # the same again replaces nothing
 
 
 def blurred_stripes(sequence, *, inverses, fine_first, gray=1):

@@ -128,6 +128,13 @@ def test_a_board_that_is_declared_otherwise_is_named():
     assert "0 markers of aruco5, fewer" in find_board(np.full((90, 120), 0.4, np.float32), BOARD, PRINTED)
 
 
+def test_one_row_of_markers_is_not_blamed_on_the_declaration():
+    """Of a right declaration, where all but one row of the board hangs out of the image."""
+    strip = 0.06 + 0.7 * print_of("aruco5", (11, 5), size=60)[55:125].astype(np.float32)
+    for declared in ((11, 5), (9, 5)):
+        assert "lie in one line" in find_board(strip, declared, PRINTED)
+
+
 def test_markers_that_fit_no_board_are_refused():
     def refused(**given):
         with pytest.raises(ValidationError) as fault:

@@ -14,6 +14,8 @@ from tests.scenes.captures import write_image
 SIZE, FOCAL, PROJECTED, LENS = (150, 110), 170.0, (200, 150), 230.0
 RIGS = {"right": ((0.25, 0.02, 0.0), 1.2), "left above": ((-0.3, 0.15, 0.05), 1.6), "above": ((0.03, 0.28, -0.02), 1.4)}
 WRONG = {"yaw": ((0.0, 1.0, 0.0), 1.0), "roll": ((0.0, 0.0, 1.0), 1.0), "pitch": ((-0.5, 0.0, 0.0), 1.0), "focal": ((0.0, 0.0, 0.0), 1.04)}
+ASIDE = 3.5
+"""Pixels by which a principal point is wrong, 1.5 % of the focal length."""
 
 
 def turn(degrees):
@@ -89,8 +91,21 @@ def test_right_calibrations_raise_no_doubt(rig, stripes):
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_wrong_projector_is_said_and_covered(rig, wrong):
     found, error = judged(rig, wrong, 0.05)
-    assert found is not None and "projector: columns and rows contradict" in found.sentence()
+    assert found is not None and "projector: columns and rows contradict" in found.sentence(found.projector)
     assert np.median(error / found.sigma) < 1.4 and (error > 5 * found.sigma).mean() < 0.01
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_principal_point_aside_is_covered(rig):
+    """It looks like a turn, which moves all depths otherwise: the fit must not take one for the other."""
+    points, pose, uv = scene(rig, 5)
+    uv = uv + np.random.default_rng(5).normal(0, 0.05, uv.shape)
+    given = {**declared(pose), "principal_px": [PROJECTED[0] / 2 + ASIDE, PROJECTED[1] / 2 - ASIDE]}
+    found = triangulated(points, uv, given)
+    error = np.linalg.norm(found - points, axis=-1).ravel()
+    told = contradiction(Projector.model_validate(given), found.reshape(-1, 3), uv.reshape(-1, 2), np.full((error.size, 2), 0.05))
+    assert told is None or (np.median(error / told.sigma) < 1.4 and (error > 5 * told.sigma).mean() < 0.01)
+    assert told is not None or np.median(error) < 0.01
 
 
 def written(folder, wrong):
@@ -128,3 +143,29 @@ def test_depth_says_it(relit, tmp_path, wrong):
     else:
         assert any("contradict its calibration" in sentence for sentence in warnings)
         assert np.median(error) < 1.4 and (error > 5).mean() < 0.02
+
+
+@pytest.mark.parametrize("wrong", ["yaw", "roll"])
+def test_a_projector_is_refined(relit, tmp_path, wrong):
+    """Depths are nearer to the truth, and σ holds what is left; the report tells the projector."""
+    depth = written(tmp_path, wrong)
+    errors = {}
+    for name, words in (("declared", []), ("refined", ["--refine-projector"])):
+        relit("depth", tmp_path, "--out", tmp_path / name, "--device", "cpu", "--least-confidence", "0", *words).well()
+        maps = DepthMaps.read(tmp_path / name / "depth.exr")
+        error = np.abs(maps.depth - depth)[maps.mask]
+        errors[name], error = float(np.median(error)), error / maps.sigma[maps.mask]
+        assert np.median(error) < 1.4 and (error > 5).mean() < 0.02
+    assert errors["refined"] < 0.5 * errors["declared"]
+    found = json.loads((tmp_path / "refined" / "report.json").read_text())["found"]["refined_projector"]
+    turned = np.array(found["camera_from_projector"])[:3, :3]
+    true, given = (np.array(declared(scene("right", 8)[1], name)["camera_from_projector"])[:3, :3] for name in (None, wrong))
+    assert np.trace(true.T @ turned) > np.trace(true.T @ given)
+
+
+def test_what_cannot_be_refined_is_refused(relit, tmp_path):
+    written(tmp_path, None)
+    manifest = json.loads((tmp_path / "capture.json").read_text())
+    manifest["frames"] = [frame for frame in manifest["frames"] if frame["pattern"]["axis"] == "column"]
+    (tmp_path / "capture.json").write_text(json.dumps(manifest))
+    relit("depth", tmp_path, "--out", tmp_path / "out", "--refine-projector").refused("one axis alone")
