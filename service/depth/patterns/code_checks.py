@@ -33,6 +33,11 @@ PLACES, AT_A_PLACE, OF_STEPS = 3, 8, 0.01
 steps, from which on that order is named. An edge of depth jumps between other stripes in every row."""
 MENDED = 5.0
 """Jumps that another order mends over those that it makes."""
+CONTRADICTED, FOLLOWED = 0.25, 0.4
+"""Part of the neighbours that differ in one bit of a Gray code alone whose stripes follow each other: below the first for a bit, the order
+of bits is wrong, and above the second for every bit, it is right. In scenes full of edges it is 0.73 at least for the right order."""
+LEAST_ROWS = 5
+"""Number of image rows in which a bit must change at such neighbours to be judged."""
 BEYOND_SHARE = 0.02
 """Share of the neighbours whose stripes lie beyond the projector, side by side, from which on its size is doubted."""
 LEAST_PERIODS = 4
@@ -136,33 +141,62 @@ def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
     if len(steps) < ENOUGH:
         return None
     stripe_px = code.stripe_px * 2**stripes.finest
+    swap = _exchanged(stripes.bits, pairs) if code.name == "gray" else None
+    if swap is not None:
+        return (f"neighbouring {code.axis} stripes differ in one bit, and do not follow each other as declared; they do if "
+                f"{_exchange_words(swap, stripes)}")
     usual = max(float(np.median(steps[steps > 0])) if steps.any() else 1.0, 1.0)
     jumps = steps > JUMP * usual
     beyond = (np.minimum(*(declared.ravel()[side] for side in (pairs.first, pairs.second))) * stripe_px >= extent) & ~jumps
     outside = beyond.sum() > max(BEYOND_SHARE * len(steps), AT_A_PLACE)
     if steps.any():
         orders = [("binary" if code.name == "gray" else "gray", None)] if code.name != "xor" else []
-        swaps = [] if code.name == "xor" else list(combinations(range(len(stripes.bits)), 2))
+        swaps = list(combinations(range(len(stripes.bits)), 2)) if code.name == "binary" else []
         mended: list[tuple[float, str]] = []
         for other, swap in [*orders, *((code.name, swap) for swap in swaps)]:
-            bits = stripes.bits
-            if swap is not None:
-                order = np.arange(len(bits))
-                order[list(swap)] = swap[::-1]
-                bits = bits[order]
+            bits = stripes.bits if swap is None else _with_exchanged(stripes.bits, swap)
             part = _mends(_numbers(bits, gray=other != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside))
-            words = (f"a {code.name} code is declared, and they follow each other as those of a {other} code: check code" if swap is None
-                     else f"they follow each other if the bits {' and '.join(str(bit + stripes.finest) for bit in swap)} are exchanged: "
-                          "check bit")
+            words = (f"a {code.name} code is declared, and they follow each other as those of a {other} code: check code in the frames' "
+                     "patterns" if swap is None
+                     else f"they follow each other if {_exchange_words(swap, stripes)}")
             if part is not None:
                 mended.append((part, words))
         if mended:
-            return f"the {code.axis} stripes jump between {jumps.sum()} neighbours; {min(mended)[1]} in the frames' patterns"
+            return f"the {code.axis} stripes jump between {jumps.sum()} neighbours; {min(mended)[1]}"
     if outside:
         widest = np.percentile(np.maximum(declared.ravel()[pairs.first], declared.ravel()[pairs.second])[~jumps], 99.9)
         return (f"{100 * beyond.mean():.2g} % of the {code.axis} stripes that are seen lie beyond the {extent} px of projector.resolution: "
                 f"the projector looks {(widest + 1) * stripe_px:.0f} px large at least; check stripe_px and bit too")
     return None
+
+
+def _with_exchanged(bits: np.ndarray, swap: tuple[int, int]) -> np.ndarray:
+    order = np.arange(len(bits))
+    order[list(swap)] = swap[::-1]
+    return bits[order]
+
+
+def _exchange_words(swap: tuple[int, int], stripes: Stripes) -> str:
+    return f"the bits {' and '.join(str(bit + stripes.finest) for bit in swap)} are exchanged: check bit in the frames' patterns"
+
+
+def _exchanged(bits: np.ndarray, pairs: _Pairs) -> tuple[int, int] | None:
+    """Return two bits of a Gray code that are exchanged, None if none are: stripes side by side differ in one bit, and few others do."""
+    flat = bits.reshape(len(bits), -1)
+    changes = flat[:, pairs.first] != flat[:, pairs.second]
+    alone = changes.sum(axis=0) == 1
+    ends = flat[:, np.stack([pairs.first, pairs.second])[:, alone]]  # [bits, 2, pairs]
+    edges = [edge for edge in changes[:, alone] if len(np.unique(pairs.row[alone][edge])) >= LEAST_ROWS]
+
+    def following(order: np.ndarray) -> float:
+        first, second = _numbers(order, gray=True)
+        follow = np.abs(second - first) == 1
+        return min((float(follow[edge].mean()) for edge in edges), default=1.0)
+
+    if following(ends) >= CONTRADICTED:
+        return None
+    likely, swap = max((following(_with_exchanged(ends, swap)), swap) for swap in combinations(range(len(bits)), 2))
+    return swap if likely >= FOLLOWED else None
 
 
 def _mends(numbers: np.ndarray, pairs: _Pairs, declared: np.ndarray, jumps: np.ndarray, count: float, *, outside: bool) -> float | None:
