@@ -79,7 +79,8 @@ def _ask(asked: dict[str, Any], progress: Progress) -> dict[str, Any]:
             process.stdin.write(json.dumps(asked).encode() + b"\n")
             process.stdin.flush()
         except BrokenPipeError:  # it could not start: the exit code tells
-            pass
+            with suppress(BrokenPipeError):  # of what was not sent, which closing sends once more
+                process.stdin.close()
         answer = _answer(process, progress)
         if answer is None:
             with suppress(subprocess.TimeoutExpired):

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from service.requests.base.base import Choice, Commas, DeviceRequest, Options, Role, Spelling
-from stage.model import Finite, Fraction, NotNegative, Positive
+from stage.model import Finite, Fraction, NotNegative, Positive, Text
 
 
 class BoardForm(Choice):
@@ -114,7 +114,7 @@ class InspectPasteRequest(DeviceRequest):
     offset of the whole print is not seen."""
     limits: Annotated[Path | None, Role.INPUT] = None
     """Limits of the pads (JSON, schema relit.paste-limits/1). None: pads are measured and not judged."""
-    limit_class: str | None = None
+    limit_class: Text | None = None
     """Class of the limits. None: the only one of the file."""
     area_level: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Height above which paste belongs to its area, as a part of the stencil's thickness."""

@@ -11,6 +11,7 @@ from kernels.status import Status
 from service.cli.main import program
 from stage.capture.manifest import read_manifest
 from stage.sets.board import BoardDesign, BoardRegions, BoardScan, GaugeRuns
+from stage.sets.paste_limits import PasteLimits
 from stage.sets.scan_set import ScanSet
 from stage.sets.tolerance_regions import Tolerances
 from stage.tof.calibration import Sweep, TofCalibration
@@ -19,7 +20,7 @@ from stage.tof.scan import Scan
 HOME = Path(__file__).parents[2]
 PROGRAM: Any = get_command(program())
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in (HOME / "README.md", *sorted((HOME / "docs").glob("*.md")))}
-SHOWN = {"inspection.md": [BoardScan, BoardDesign, BoardRegions, GaugeRuns, Tolerances], "scans.md": [ScanSet],
+SHOWN = {"inspection.md": [BoardScan, BoardDesign, BoardRegions, PasteLimits, GaugeRuns, Tolerances], "scans.md": [ScanSet],
          "time_of_flight.md": [TofCalibration, Sweep, Scan]}
 """What the JSON blocks of a page are, in their order."""
 DESCRIBED = {"relight": set(), "view": {"--out", "--no-align"}}
