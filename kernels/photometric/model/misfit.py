@@ -49,6 +49,8 @@ WRONG_FIT = np.radians(45.0)
 TURN = 1.3
 """Angle in radians by which light from other surfaces turns a normal, for each part of the albedo that a pixel shines with under lights
 behind it: there all light is theirs, and in front of it as much is added. Measured on two path-traced objects with folds."""
+LEAST_BEHIND = 0.1
+"""Part of the pixels behind which some light must stand for these to speak for the others."""
 LARGEST_ERROR = 90.0
 """Degrees: a visible normal that is not known at all is hardly further off."""
 MAJORITY, CLEAR_MAJORITY = 0.5, 0.6
@@ -153,11 +155,14 @@ def _median_of_chi_squared(freedom: np.ndarray) -> np.ndarray:
 
 
 def _bounced(pairs: PairFits) -> float:
-    """Return the median of the mean readings under lights behind the surface, in |b|; 0 where no pixel has one."""
+    """Return the median of the mean readings under lights behind the surface, in |b|; 0 where few pixels have one: those of a rim alone,
+    where light and neighbours mix, do not speak for the object."""
     relative, cosine = _relative(pairs)
     behind = cosine < BEHIND
     count = behind.sum(axis=0)
-    return float(np.median((relative * behind).sum(axis=0)[count > 0] / count[count > 0])) if count.any() else 0.0
+    if np.count_nonzero(count) <= LEAST_BEHIND * count.size:
+        return 0.0
+    return float(np.median((relative * behind).sum(axis=0)[count > 0] / count[count > 0]))
 
 
 def _residuals(pairs: PairFits) -> np.ndarray:
