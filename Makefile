@@ -67,6 +67,7 @@ screenshots: $(VENV)/installed-dev
 	  tests/service/server/pages/test_home_page.py tests/service/server/pages/test_machines_page.py \
 	  tests/service/server/pages/test_set_page.py tests/service/server/pages/test_published_page.py -k "shows_the_sample or to_an_asset or a_fault_is_named_and_mended"
 	$(BIN)/python -m docs.tools.chart_picture
+	$(BIN)/python -m docs.tools.view_picture
 
 # the lock records versions and hashes, and no download address
 lock:
