@@ -9,7 +9,7 @@ import inspect
 import pkgutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -53,13 +53,14 @@ def package_of(kernel: Any) -> list[Any]:
     return list(dict.fromkeys([kernel.module, *others]))
 
 
-def build(folder: Path, architectures: Iterable[int]) -> list[Path]:
+def build(folder: Path, architectures: Iterable[int], progress: Callable[[int, int], None] | None = None) -> list[Path]:
     """Compile every kernel for architectures of GPUs, with a thread for each core; no GPU is needed.
 
     Args:
         folder: gets a `.cubin` of each kernel and architecture and a `.meta` of each kernel, under names that tell their content; it may
             hold others.
         architectures: 90 for compute capability 9.0.
+        progress: is told how many are compiled, and of how many; what it raises ends the work. Files that are there are whole.
 
     Returns:
         The cubins.
@@ -85,7 +86,14 @@ def build(folder: Path, architectures: Iterable[int]) -> list[Path]:
 
         with ThreadPoolExecutor(devices.worker_count()) as pool:
             jobs = [pool.submit(compile_one, devices.cuda_module(make()), each) for make in every_kernel().values() for each in wanted]
-            return sorted({path for job in jobs for path in job.result() if path.suffix == ".cubin"})
+            try:
+                for number, job in enumerate(as_completed(jobs), start=1):
+                    job.result()
+                    if progress is not None:
+                        progress(number, len(jobs))
+            finally:
+                pool.shutdown(cancel_futures=True)
+    return sorted({path for job in jobs for path in job.result() if path.suffix == ".cubin"})
 
 
 def _factories(module: Any) -> Iterator[tuple[str, Any]]:

@@ -76,6 +76,20 @@ for name in {names}:
     assert resources(tmp_path / f"{asked[0]}.sm90.cubin").registers == HOT[names[0]].registers
 
 
+@pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
+def test_an_interrupted_build_leaves_whole_files_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(ahead, "every_kernel", lambda: {name: KERNELS[name] for name in ("surface.multigrid._smooth_from_zero",)})
+    told = []
+
+    def interrupt(*counts):
+        told.append(counts)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ahead.build(tmp_path, [86, 90], interrupt)
+    assert told == [(1, 2)] and {path.suffix for path in tmp_path.iterdir()} == {".cubin", ".meta"}
+
+
 def measured(name: str, folder: Path) -> Resources:
     """Return what the kernels of a Warp module take on an H100."""
     wp.compile_aot_module(KERNELS[name]().module, arch=H100, module_dir=folder, use_ptx=False)

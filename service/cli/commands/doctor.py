@@ -1,5 +1,6 @@
 """relit doctor: check this installation; relit kernels: compile its kernels ahead."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -59,6 +60,8 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
                 faults += _wrong_products(name)
             if not sound:
                 faults.append(f"{name} gives wrong sums")
+        if os.environ.get("RELIT_KERNELS") and not device.MADE_AHEAD.is_dir():
+            faults.append(f"{device.MADE_AHEAD}, which RELIT_KERNELS names, is no folder: kernels are compiled on this machine")
         outdated = None if only else device.outdated_driver()
         faults += [outdated] if outdated else []
         with tempfile.TemporaryDirectory() as folder:
@@ -82,9 +85,17 @@ def kernels(
     An installation finds those in its own folder, and those in the folder that the environment variable RELIT_KERNELS names.
     """
     from kernels import ahead, device
+    from service.cli.progress import ProgressBar
 
     folder = out or device.MADE_AHEAD
-    made = ahead.build(folder, arch)
+    with ProgressBar() as bar:
+
+        def show(done: int, total: int) -> None:
+            if done == 1:
+                bar.stage("compile", total)
+            bar.advance(done)
+
+        made = ahead.build(folder, arch, show)
     print(f"{folder}: {len(made)} kernels for {', '.join(f'sm_{each}' for each in dict.fromkeys(arch))}, "
           f"{sum(path.stat().st_size for path in made) / 1e6:.1f} MB")
 

@@ -193,3 +193,11 @@ def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(relit, mon
     monkeypatch.setattr(os, "environ", {**os.environ, **given})
     relit("--version")
     assert os.environ.get("OPENBLAS_NUM_THREADS") == expected
+
+
+def test_a_folder_of_kernels_that_is_not_there_is_said(relit, tmp_path, monkeypatch):
+    folder = tmp_path / "none"
+    monkeypatch.setenv("RELIT_KERNELS", str(folder))
+    monkeypatch.setattr("kernels.device.MADE_AHEAD", folder)
+    outcome = relit("doctor", "--device", "cpu")
+    assert outcome.code == 1 and f"{folder}, which RELIT_KERNELS names, is no folder" in outcome.out
