@@ -223,8 +223,12 @@ def test_a_local_environment_is_shown_spins_and_is_not_sent(opened):
     opened.locator("canvas.preview").wait_for(timeout=60_000)
     before = picture(opened)
     opened.get_by_role("button", name="Spin").click()
-    opened.wait_for_function("() => relit.state().environment.turn_degrees > 20")
-    opened.get_by_role("button", name="Spin").click()
+    opened.wait_for_function("""() => {
+      const turn = relit.state().environment.turn_degrees;
+      if (turn < 30 || turn > 330) return false;
+      [...document.querySelectorAll("button")].find((button) => button.textContent === "Spin").click(); // before it is back
+      return true;
+    }""")
     seen(opened, lambda: np.abs(picture(opened) - before).mean() > 1 / 255)
     opened.get_by_role("button", name="Render").click()
     opened.get_by_text("environment.exr is a file of this machine: upload it").first.wait_for()
