@@ -169,5 +169,5 @@ def widen(solution: DepthSolution, found: Contradiction, judged: np.ndarray, dec
     solution.warnings.append(found.sentence(declared, refined=refined))
     solution.facts["contradiction_px"] = float(f"{found.size_px:.3g}")
     if refined:
-        solution.facts["refined_projector"] = found.projector.model_dump(
-            mode="json", include={"focal_px", "principal_px", "camera_from_projector"})
+        projector = found.projector.model_dump(mode="json")
+        solution.facts["refined_projector"] = {name: projector[name] for name in ("focal_px", "principal_px", "camera_from_projector")}
