@@ -20,16 +20,17 @@ class TcpProxy:
         self._lock = threading.Lock()
         self._open: set[socket.socket] = set()
         self._budget: int | None = None
+        self._budget_away_s = 0.0
         self._away_until = 0.0
         self._damaged = 0
         self.cuts = 0
         """How often connections that were open have been cut."""
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def cut_after(self, count: int) -> None:
-        """Cut all connections once, when so many bytes have passed."""
+    def cut_after(self, count: int, *, away_s: float = 0.0) -> None:
+        """Cut all connections once as `cut` does, when so many bytes have passed."""
         with self._lock:
-            self._budget = count
+            self._budget, self._budget_away_s = count, away_s
 
     def cut(self, *, away_s: float = 0.0) -> None:
         """Cut all connections, and refuse new ones for some seconds."""
@@ -93,7 +94,7 @@ class TcpProxy:
         with contextlib.suppress(OSError):
             while piece := source.recv(1 << 14):
                 if self._spent(len(piece)):
-                    self.cut()
+                    self.cut(away_s=self._budget_away_s)
                     return
                 sink.sendall(piece)
         for each in (source, sink):

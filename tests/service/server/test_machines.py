@@ -48,13 +48,13 @@ def test_cut_connections_lose_nothing_between_machines_that_share_no_folder(tmp_
                 uploaded = client.captures.upload(capture)
                 assert to_api.cuts == 1 and uploaded.state == "ready"
                 lit = client.environments.upload(sky)
+                made = sum(path.stat().st_size for path in (tmp_path / "expected").rglob("*") if path.is_file())
+                to_store.cut_after(made // 2, away_s=2.0)  # of what the worker reads of the capture and writes of the frames
                 job = client.jobs.submit(RelightJob(kind="relight", capture=uploaded.id, environment=lit.id,
                                                     options=RelightOptions(frames=f"1-{FRAMES}", spin_degrees=360)))
                 for view in client.jobs.follow(job.id):
                     done = 0 if view.progress is None or view.progress.stage != "frames" else view.progress.done
-                    if done >= 4 and to_store.cuts == 0:
-                        to_store.cut_when_open(away_s=2.0)
-                    if done >= 12 and to_database.cuts == 0:  # after the store: without the database no progress is told
+                    if done >= 12 and to_database.cuts == 0:
                         to_database.cut_when_open(away_s=2.0)
                 ended = client.jobs.get(job.id)
                 assert (ended.state, ended.error) == ("succeeded", None), (tmp_path / "worker.log").read_text()[-4000:]
