@@ -4,15 +4,14 @@ Source: AIAG, Statistical Process Control, 2nd edition, 2005: indices from the s
 in common speech); the lower bound of Cpk by Bissell, "How reliable is your capability index?", Applied Statistics 39(3), 1990.
 """
 
-import csv
-import io
 import json
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from service.boards.tables import rounded, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import BoardCapabilityRequest
@@ -91,10 +90,11 @@ def board_capability(request: BoardCapabilityRequest, progress: Progress | None 
         raise BoardError(f"{request.study}: no pad or region with limits was measured on {LEAST_BOARDS} boards that differ")
     found.sort(key=lambda each: each.cpk)
     table_path, report_path = request.out / CAPABILITY_FILE, request.out / REPORT_FILE
-    write_text(table_path, _table(found))
+    rows = [rounded(each._asdict()) for each in found]
+    write_text(table_path, table_text(Capability._fields, rows))
     write_text(report_path, report(
         request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
-        boards=len({run.board for run in runs.runs}), left_out=left_out, capability=[_rounded(each) for each in found],
+        boards=len({run.board for run in runs.runs}), left_out=left_out, capability=rows,
         timings_s=timings.close()))
     return BoardCapabilityResult(table_path, report_path, found, tuple(left_out))
 
@@ -117,15 +117,3 @@ def _values(path: Path) -> dict[Value, tuple[float | None, Limits]]:
                 for region in content["regions"]}
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise ManifestError(f"{path}: is no report of relit inspect-paste, or of relit inspect-board with regions") from error
-
-
-def _table(found: list[Capability]) -> str:
-    out = io.StringIO()
-    table = csv.DictWriter(out, Capability._fields, lineterminator="\n")
-    table.writeheader()
-    table.writerows(map(_rounded, found))
-    return out.getvalue()
-
-
-def _rounded(each: Capability) -> dict[str, Any]:
-    return {name: float(f"{value:.6g}") if isinstance(value, float) else value for name, value in each._asdict().items()}

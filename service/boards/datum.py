@@ -10,8 +10,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from service.boards.stitching.form import fit_form
-from service.boards.stitching.grid import HeightMap, robust_sigma
-from service.boards.stitching.overlap import TUKEY
+from service.boards.stitching.grid import HeightMap, robust_sigma, tukey_weights
 from stage.errors import BoardError
 
 LEAST_CORRELATION = 0.5
@@ -99,7 +98,7 @@ def fit_datum(places_m: np.ndarray, offsets_m: np.ndarray, *, pixel_m: float) ->
         found = np.linalg.lstsq(rows * root[:, None], wanted * root, rcond=None)[0]
         left = wanted - rows @ found
         scale = max(robust_sigma(left), LEAST_SIGMA_PX * pixel_m)
-        weight = np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None))
+        weight = tukey_weights(left, scale)
     return Datum(found[:2], float(found[2]), middle, scale**2 * np.linalg.pinv((rows * weight[:, None]).T @ rows))
 
 

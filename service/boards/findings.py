@@ -1,7 +1,5 @@
 """The rows that an inspection lists: defects, regions, and areas that were not inspected."""
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +9,7 @@ from scipy.ndimage import find_objects, label
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import RegionResult
 from service.boards.stitching.significance import Scan, grown, mean_of, region_of, weighted_centre
+from service.boards.tables import rounded, table_text
 
 FINDINGS_FILE = "findings.csv"
 MOST_AREAS = 1000
@@ -115,34 +114,32 @@ def find_areas(grid: BoardGrid, pixels: np.ndarray) -> tuple[list[Area], int]:
 
 def findings_csv(defects: Sequence[Defect], regions: Sequence[RegionResult], areas: Sequence[Area]) -> str:
     """Return the table of all findings: one line for each defect, region and area not inspected."""
-    out = io.StringIO()
-    table = csv.DictWriter(out, COLUMNS, lineterminator="\n")
-    table.writeheader()
+    rows: list[dict[str, Any]] = []
     for number, defect in enumerate(defects, start=1):
-        table.writerow({"kind": "defect", "name": f"defect {number}", "verdict": "fail", **_numbers(defect.area._asdict()),
-                        "measured_pixels": defect.area.pixels, **_numbers({key: getattr(defect, key) for key in (
-                            "deviation_m", "sigma_m", "significance", "peak_m", "volume_m3")})})
+        rows.append({"kind": "defect", "name": f"defect {number}", "verdict": "fail", **rounded(defect.area._asdict()),
+                     "measured_pixels": defect.area.pixels, **rounded({key: getattr(defect, key) for key in (
+                         "deviation_m", "sigma_m", "significance", "peak_m", "volume_m3")})})
     for result in regions:
         region = result.region
-        table.writerow({"kind": "region", "name": region.name, "verdict": result.verdict, "pixels": result.pixels,
-                        "measured_pixels": result.measured, **_numbers({
-                            "x_m": region.centre_m[0], "y_m": region.centre_m[1], "width_m": region.size_m[0], "height_m": region.size_m[1],
-                            "deviation_m": result.deviation_m, "sigma_m": result.sigma_m, "tolerance_low_m": region.tolerance_m[0],
-                            "tolerance_high_m": region.tolerance_m[1]})})
+        rows.append({"kind": "region", "name": region.name, "verdict": result.verdict, "pixels": result.pixels,
+                     "measured_pixels": result.measured, **rounded({
+                         "x_m": region.centre_m[0], "y_m": region.centre_m[1], "width_m": region.size_m[0], "height_m": region.size_m[1],
+                         "deviation_m": result.deviation_m, "sigma_m": result.sigma_m, "tolerance_low_m": region.tolerance_m[0],
+                         "tolerance_high_m": region.tolerance_m[1]})})
     for number, area in enumerate(areas, start=1):
-        table.writerow({"kind": "area", "name": f"area {number}", "verdict": "not inspected", **_numbers(area._asdict()),
-                        "measured_pixels": 0})
-    return out.getvalue()
+        rows.append({"kind": "area", "name": f"area {number}", "verdict": "not inspected", **rounded(area._asdict()),
+                     "measured_pixels": 0})
+    return table_text(COLUMNS, rows)
 
 
 def entries(defects: Sequence[Defect], regions: Sequence[RegionResult]) -> dict[str, Any]:
     """Return the defects and regions for a report."""
     return {
-        "defects": [_numbers({**defect.area._asdict(), **{key: value for key, value in defect._asdict().items() if key != "area"}})
+        "defects": [rounded({**defect.area._asdict(), **{key: value for key, value in defect._asdict().items() if key != "area"}})
                     for defect in defects],
         "regions": [{"name": result.region.name, "verdict": str(result.verdict), "pixels": result.pixels, "measured": result.measured,
                      "tolerance_m": list(result.region.tolerance_m),
-                     **_numbers({"deviation_m": result.deviation_m, "sigma_m": result.sigma_m})} for result in regions],
+                     **rounded({"deviation_m": result.deviation_m, "sigma_m": result.sigma_m})} for result in regions],
     }
 
 
@@ -157,7 +154,3 @@ def _area(grid: BoardGrid, row: np.ndarray, col: np.ndarray, middle: tuple[float
     x, y = grid.coordinates(np.array(middle[0]), np.array(middle[1]))
     pixel = grid.pixel_m
     return Area(float(x), float(y), float(np.ptp(col) + 1) * pixel, float(np.ptp(row) + 1) * pixel, row.size * pixel**2, int(row.size))
-
-
-def _numbers(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in values.items()}

@@ -5,8 +5,6 @@ Repeatability and reproducibility follow from the values by analysis of variance
 Source: AIAG, Measurement Systems Analysis, 4th edition, 2010, chapter III, section B (ANOVA method).
 """
 
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
+from service.boards.tables import six_digits, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import GaugeBoardRequest
@@ -119,7 +118,7 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
     write_text(report_path, report(
         request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
         study={"parts": len(parts), "operators": len({operator for _, operator in found}), "trials": parts[0].values.shape[1],
-               **{f"{name}_m": None if value is None else float(f"{value:.6g}") for name, value in study._asdict().items()
+               **{f"{name}_m": None if value is None else six_digits(value) for name, value in study._asdict().items()
                   if name != "degrees_of_freedom"},
                "degrees_of_freedom": study.degrees_of_freedom, "gauge_percent": float(f"{study.gauge_percent:.4g}"),
                "tolerance_percent": float(f"{percent:.4g}"), "narrowest_tolerance_m": width, "distinct_categories": study.categories,
@@ -166,15 +165,11 @@ def _parts(path: Path, found: dict[tuple[str, str], list[dict[str, Any]]]) -> tu
 
 
 def _table(parts: list[_Part]) -> str:
-    out = io.StringIO()
-    table = csv.DictWriter(out, COLUMNS, lineterminator="\n")
-    table.writeheader()
-    for part in parts:
-        table.writerow({"board": part.board, "region": part.region, "mean_m": f"{part.values.mean():.6g}",
-                        "repeatability_m": f"{np.sqrt(part.values.var(axis=1, ddof=1).mean()) if part.values.shape[1] > 1 else 0:.6g}",
-                        "sigma_m": f"{np.sqrt(np.square(part.sigmas).mean()):.6g}",
-                        "values": " ".join(f"{value:.6g}" for value in part.values.ravel())})
-    return out.getvalue()
+    return table_text(COLUMNS, (
+        {"board": part.board, "region": part.region, "mean_m": f"{part.values.mean():.6g}",
+         "repeatability_m": f"{np.sqrt(part.values.var(axis=1, ddof=1).mean()) if part.values.shape[1] > 1 else 0:.6g}",
+         "sigma_m": f"{np.sqrt(np.square(part.sigmas).mean()):.6g}",
+         "values": " ".join(f"{value:.6g}" for value in part.values.ravel())} for part in parts))
 
 
 def gauge_study(values: np.ndarray) -> GaugeStudy:

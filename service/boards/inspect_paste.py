@@ -4,8 +4,6 @@ The way of the data: tiles → stitched and blended → registered to the openin
 every pad (paste.py), whose offsets count from marks or from most of the paste (datum.py) → verdicts by limits and σ → the files.
 """
 
-import csv
-import io
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +15,11 @@ from service.boards.height_files import BOARD_FILE, write_board
 from service.boards.inspect_board import stitch_board, stitching_entries
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
 from service.boards.paste import Measured, PadPaste, Paste, measure_paste, openings_of
-from service.boards.stitching.grid import HeightMap
+from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
 from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend
+from service.boards.tables import six_digits, table_text
 from service.boards.tiles import BoardTiles, read_tiles
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -89,10 +88,11 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
     marks[:, 0] *= -1 if mirrored else 1
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
     stitched = stitch_board(board, request.pixel_m, timings)
-    heights, warnings = _placed(board, stitched, pads, request, timings)
+    search_m = SEARCH_SIGMA * (request.placement_m or SHIFT_SIGMA_PX * stitched.grid.pixel_m)
+    heights, warnings = _placed(board, stitched, pads, request, search_m, timings)
     timings.stage("measure", 1)
     paste = measure_paste(heights, pads, stencil_m=request.stencil_m, area_level=request.area_level, bridge_level=request.bridge_level)
-    found = _datum(paste, pads, marks, request)
+    found = _datum(paste, pads, marks, request, search_m)
     results = _judge(paste, pads, names, found.datum, limits, _tile_variance(board, stitched, pads), request)
     verdict = _worst(results) if limits else None
     if not found.asked:
@@ -106,7 +106,7 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
                                                             method=METHOD, contents=contents))
     pads_path, picture_path, report_path = (request.out / name for name in (PADS_FILE, PICTURE_FILE, REPORT_FILE))
     rows = [_row(result) for result in results]
-    write_text(pads_path, _table(rows))
+    write_text(pads_path, table_text(list(rows[0]), ({**row, "bridged_with": " ".join(row["bridged_with"])} for row in rows)))
     full = np.where(openings_of(heights.grid, pads) > 0, request.stencil_m, 0.0)
     deviation = paste.height._replace(height=paste.height.height - full)
     write_picture(picture_path, heights, deviation, heights.measured, full > 0, [],
@@ -117,8 +117,8 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
         stitching=stitching_entries(board, stitched), warnings=warnings, device=devices.describe(device),
         verdict=None if verdict is None else str(verdict), bridge_level_m=paste.bridge_level_m,
         datum={"by": "marks" if found.asked else "paste", "marks_found": found.found, "marks_looked_for": found.asked,
-               "shift_m": [_round(value) for value in datum.shift_m], "turn_degrees": _round(np.degrees(datum.turn)),
-               "shift_sigma_m": [_round(value) for value in np.sqrt(np.diag(datum.covariance)[:2])]},
+               "shift_m": [six_digits(value) for value in datum.shift_m], "turn_degrees": six_digits(np.degrees(datum.turn)),
+               "shift_sigma_m": [six_digits(value) for value in np.sqrt(np.diag(datum.covariance)[:2])]},
         pads=[{**row, "limits": result.limits} for row, result in zip(rows, results, strict=True)], timings_s=timings.close()))
     return InspectPasteResult(request.out / BOARD_FILE, report_path, picture_path, pads_path, verdict, results, datum, tuple(warnings))
 
@@ -140,20 +140,25 @@ def _components(request: InspectPasteRequest, pads: list[Pad]) -> list[Any]:
     return components
 
 
-def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: InspectPasteRequest, timings: Timings
+def _on(grid: BoardGrid, places_m: np.ndarray) -> np.ndarray:
+    """Return which places, [n, 2], lie on the grid, [n] bool."""
+    row, col = grid.place(*places_m.T)
+    return np.asarray((row > 0) & (row < grid.rows) & (col > 0) & (col < grid.cols))
+
+
+def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: InspectPasteRequest, search_m: float, timings: Timings
             ) -> tuple[HeightMap, list[str]]:
     """Return the heights of the board where its paste lies on the openings."""
     grid = stitched.grid
     timings.stage("match", 2 * len(board.tiles))
     first = blend(board.tiles, stitched, grid, progress=timings.advance)
-    row, col = grid.place(*np.array([pad.centre_m for pad in pads]).T)
-    within = np.mean((row > 0) & (row < grid.rows) & (col > 0) & (col < grid.cols))
+    within = _on(grid, np.array([pad.centre_m for pad in pads])).mean()
     if within < LEAST_SEEN:
         raise BoardError(f"{request.paste}: {100 * (1 - within):.0f} % of its openings lie beyond what was measured, which is "
                          f"{1e3 * grid.size_m[0]:.4g} x {1e3 * grid.size_m[1]:.4g} mm from ({1e3 * grid.left_m:.4g}, "
                          f"{1e3 * (grid.top_m - grid.size_m[1]):.4g}) mm on: give the place of the board's origin in the layer with "
                          "--origin-m")
-    search = int(np.ceil(SEARCH_SIGMA * (request.placement_m or SHIFT_SIGMA_PX * grid.pixel_m) / grid.pixel_m))
+    search = int(np.ceil(search_m / grid.pixel_m))
     apart = np.median([pad.size_m.min() for pad in pads]) / grid.pixel_m / 2
     try:
         moved = lay(first, openings_of(grid, pads) > 0, stencil_m=request.stencil_m, search_px=search, apart_px=float(apart))
@@ -164,17 +169,15 @@ def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: Ins
     return heights, list(stitched.warnings)
 
 
-def _datum(paste: Paste, pads: list[Pad], marks: np.ndarray, request: InspectPasteRequest) -> _Marks:
+def _datum(paste: Paste, pads: list[Pad], marks: np.ndarray, request: InspectPasteRequest, search_m: float) -> _Marks:
     """Return what offsets count from: the marks, or most of the paste."""
     grid = paste.height.grid
     if len(marks):
-        row, col = grid.place(marks[:, 0], marks[:, 1])
-        marks = marks[(row > 0) & (row < grid.rows) & (col > 0) & (col < grid.cols)]
-        search = SEARCH_SIGMA * (request.placement_m or SHIFT_SIGMA_PX * grid.pixel_m)
-        offsets = [find_mark(paste.height, mark[:2], mark[2], deep_m=request.stencil_m, search_m=search) for mark in marks]
+        marks = marks[_on(grid, marks[:, :2])]
+        offsets = [find_mark(paste.height, mark[:2], mark[2], deep_m=request.stencil_m, search_m=search_m) for mark in marks]
         there = [(mark[:2], offset) for mark, offset in zip(marks, offsets, strict=True) if offset is not None]
         if len(there) < LEAST_MARKS:
-            raise BoardError(f"{request.marks}: {len(there)} of its {len(marks)} marks on the board are found within {search:.2g} m of "
+            raise BoardError(f"{request.marks}: {len(there)} of its {len(marks)} marks on the board are found within {search_m:.2g} m of "
                              f"their places, and {LEAST_MARKS} are needed: leave --marks out, and offsets count from most of the paste")
         places, moved = np.array(there).swapaxes(0, 1)
         return _Marks(fit_datum(places, moved, pixel_m=grid.pixel_m), len(there), len(marks))
@@ -251,27 +254,16 @@ def _row(result: PadResult) -> dict[str, Any]:
     """Return what the table and the report say of a pad."""
     pad, paste = result.pad, result.paste
     row: dict[str, Any] = {"name": result.name, "verdict": None if result.verdict is None else str(result.verdict),
-                           "x_m": _round(pad.centre_m[0]), "y_m": _round(pad.centre_m[1]), "width_m": _round(pad.size_m[0]),
-                           "height_m": _round(pad.size_m[1]), "opening_m2": _round(pad.area_m2),
-                           "seen": 0.0 if paste is None else _round(min(paste.seen, 1.0)),
-                           "volume_m3": None if paste is None else _round(paste.volume_m3)}
+                           "x_m": six_digits(pad.centre_m[0]), "y_m": six_digits(pad.centre_m[1]), "width_m": six_digits(pad.size_m[0]),
+                           "height_m": six_digits(pad.size_m[1]), "opening_m2": six_digits(pad.area_m2),
+                           "seen": 0.0 if paste is None else six_digits(min(paste.seen, 1.0)),
+                           "volume_m3": None if paste is None else six_digits(paste.volume_m3)}
     for name in ("volume_percent", "height_percent", "area_percent", "offset_x_percent", "offset_y_percent"):
         found = result.values.get(name)
-        row |= {name: None if found is None else _round(found.value), f"{name}_sigma": None if found is None else _round(found.sigma)}
+        value, sigma = (None, None) if found is None else map(six_digits, found)
+        row |= {name: value, f"{name}_sigma": sigma}
     return row | {"bridged_with": list(result.bridged)}
-
-
-def _table(rows: list[dict[str, Any]]) -> str:
-    out = io.StringIO()
-    table = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows({**row, "bridged_with": " ".join(row["bridged_with"])} for row in rows)
-    return out.getvalue()
 
 
 def _pair(values: np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.6g}")

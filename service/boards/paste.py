@@ -14,8 +14,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label, median_filter, zoom
 from scipy.special import ndtr
 
-from service.boards.stitching.grid import BoardGrid, HeightMap, robust_sigma
-from service.boards.stitching.overlap import TUKEY
+from service.boards.stitching.grid import BoardGrid, HeightMap, robust_sigma, tukey_weights
 from stage.formats.gerber import Pad
 
 REACH = 0.5
@@ -144,7 +143,7 @@ def _floor(height: np.ndarray, away: np.ndarray, box: tuple[slice, ...]) -> _Flo
     for _ in range(ROUNDS):
         left = values - basis @ found
         scale = max(robust_sigma(left), 1e-12)
-        weight = np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None))
+        weight = tukey_weights(left, scale)
         found = np.linalg.lstsq(basis * np.sqrt(weight)[:, None], values * np.sqrt(weight), rcond=None)[0]
     side = max(round(min(edge.stop - edge.start for edge in box) / (1 + 2 * REACH) / BLOCK), 2)
     _, block = np.unique(row // side * (col.max() + 1) + col // side, return_inverse=True)

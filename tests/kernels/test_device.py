@@ -117,8 +117,8 @@ def test_a_driver_that_is_too_old_is_said(driver, outdated, monkeypatch):
 
 
 def test_a_kernel_is_loaded_from_those_made_ahead(tmp_path):
-    """Of a file that Warp compiled ahead for the CPU, named for CUDA's blocks, as CUDA would load a cubin: another process finds it
-    by its name and compiles nothing."""
+    """Warp compiles a file ahead for the CPU, under the name that it has with CUDA's blocks, and it is loaded as CUDA loads a cubin:
+    another process finds it by its name and compiles nothing."""
     code = f"""
 import sys
 import warp as wp

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates
 
-from service.boards.stitching.grid import BLOCK_PX, BoardGrid, blocks_of, robust_sigma
-from service.boards.stitching.overlap import TUKEY
+from service.boards.stitching.grid import BLOCK_PX, BoardGrid, blocks_of, robust_sigma, tukey_weights
 
 ROUNDS = 12
 DEGREE = 3
@@ -98,7 +97,7 @@ def _robust(basis: np.ndarray, values: np.ndarray, further: np.ndarray | None = 
         coefficients = np.linalg.lstsq(rows, wanted, rcond=None)[0]
         left = values - coefficients @ basis
         scale = max(robust_sigma(left), 1e-12)
-        weight = np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None))
+        weight = tukey_weights(left, scale)
     return coefficients, scale
 
 

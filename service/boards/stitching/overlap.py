@@ -12,14 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.stitching.grid import BLOCK_PX, BoardGrid, HeightPatch, blocks_of, gradients, robust_sigma
+from service.boards.stitching.grid import BLOCK_PX, BoardGrid, HeightPatch, blocks_of, gradients, robust_sigma, tukey_weights
 from service.boards.stitching.shift_search import LEAST_PIXELS, SHARED_PX, find_shifts
 
 UNKNOWNS = 6
 LATERAL = slice(0, 3)
 """The unknowns of a motion in the plane of the board: x, y and rotation."""
-TUKEY = 4.685
-"""Tukey's constant: residuals beyond so many σ count nothing."""
 ROUNDS = 8
 CLEAR_SLOPE = 5.0
 """A slope says something about a shift where it is this many times its noise."""
@@ -215,7 +213,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
             left = left - np.median(left)
         normalised = left / noise
         scale = max(robust_sigma(normalised), 1e-9)
-        weight = np.square(np.clip(1 - np.square(normalised / (TUKEY * max(scale, 1.0))), 0, None)) / variance
+        weight = tukey_weights(normalised, max(scale, 1.0)) / variance
         normal = (rows * weight) @ rows.T
         if int(clear.sum()) < LEAST_CLEAR:
             normal[LATERAL], normal[:, LATERAL] = 0, 0

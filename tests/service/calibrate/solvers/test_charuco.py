@@ -129,7 +129,7 @@ def test_a_board_that_is_declared_otherwise_is_named():
 
 
 def test_one_row_of_markers_is_not_blamed_on_the_declaration():
-    """Of a right declaration, where all but one row of the board hangs out of the image."""
+    """All but one row of the board hangs out of the image; the declaration is right."""
     strip = 0.06 + 0.7 * print_of("aruco5", (11, 5), size=60)[55:125].astype(np.float32)
     for declared in ((11, 5), (9, 5)):
         assert "lie in one line" in find_board(strip, declared, PRINTED)

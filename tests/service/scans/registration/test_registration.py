@@ -187,7 +187,7 @@ def test_no_coarse_scan_of_such_a_statue_is_placed_turned():
 
 @pytest.mark.long
 def test_a_turned_scan_that_no_camera_contradicts_is_doubted():
-    """Of so few and coarse scans four are joined, one of them by a quarter turn, whose loops agree; the others that they fit tell."""
+    """Four of so few and coarse scans are joined, one of them by a quarter turn. Their loops agree; that they fit other scans too tells."""
     views = statues(9, 112, range(9))
     found = registered(views)
     facts = [ScanFacts(f"scan {number}", "", 0, 1e-4, "measured", 1.0, np.zeros(3), None, (), 0, None) for number in range(9)]

@@ -201,7 +201,7 @@ def test_a_file_that_is_no_environment_or_of_an_unknown_colour_space_is_named(op
 
 @pytest.mark.long
 def test_an_environment_that_comes_after_another_was_chosen_lights_nothing(opened, sky):
-    """It is read once more by the test, after the page has got it: by then the page has read it too."""
+    """The test reads the environment once more when the page has got it: by then the page has read it too."""
     held, path = [], f"/v1/environments/{sky}/file"
     opened.route(f"**{path}", lambda route: route.continue_() if held else held.append(route))
     opened.get_by_label("Environment map").select_option(sky)
