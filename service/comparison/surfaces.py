@@ -106,8 +106,10 @@ class Design:
 def read_design(path: Path, unit_m: float, *, device: str) -> Design:
     """Read the design of a part, whose coordinates are in a unit of so many metres."""
     if path.suffix.lower() == PLY:
-        points = read_ply_points(path).points
-        faces = read_ply_faces(path, len(points))
+        ply = read_ply_points(path)
+        if not ply.kept.all():
+            raise ResultError(f"{path}: has vertices whose coordinates are not finite, or that relit fuse invented to close holes")
+        points, faces = ply.points, read_ply_faces(path, ply.kept)
         if faces is None:
             raise ResultError(f"{path}: has no faces: a design is a surface")
         mesh = without_empty_faces(points, faces, path)
@@ -126,7 +128,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
     file = path / MESH_FILE if path.is_dir() else path
     if file.suffix.lower() == PLY:
         ply = read_ply_points(file)
-        points, normals, sigma, faces = ply.points * unit_m, ply.normals, ply.sigma, read_ply_faces(file, len(ply.points))
+        points, normals, sigma, faces = ply.points * unit_m, ply.normals, ply.sigma, read_ply_faces(file, ply.kept)
     else:
         points, faces = read_triangles(file)
         points, normals, sigma = points * unit_m, None, None

@@ -99,6 +99,14 @@ class Misplaced(Choice):
     KEEP = "keep", "fuse them all the same"
 
 
+class Closing(Choice):
+    """The holes of a fused surface that are closed."""
+
+    NONE = "none", "none: the surface is what was measured"
+    PINHOLES = "pinholes", "those of at most two voxels, in which no voxel tells whether there is surface"
+    ALL = "all", "all, by membranes whose vertices are marked as invented: the mesh is watertight"
+
+
 class FuseOptions(Options):
     """Options for fusing scans."""
 
@@ -106,6 +114,8 @@ class FuseOptions(Options):
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
     """The treatment of scans that lie beside the surface of the others by more than their σ explain."""
+    close: Closing = Closing.PINHOLES
+    """The holes of the mesh that are closed. Tiles keep all of theirs."""
     join_normals: bool = False
     """Move vertices until the surface has the photometric normals of the maps of the scans, without their drift."""
     tiles: bool = False
@@ -122,6 +132,8 @@ class FuseOptions(Options):
     def _check(self) -> Self:
         if self.tiles and self.join_normals:
             raise ValueError("join_normals: is given with tiles, which are written one by one: normals are joined on the whole mesh")
+        if self.tiles and self.close is Closing.ALL:
+            raise ValueError("close: is all, but tiles are written one by one, and a hole may lie in several: leave one of them out")
         for name in ("texture_faces", "texture_px"):
             if self.tiles and getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: is given with tiles, which have no texture: leave one of them out")

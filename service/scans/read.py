@@ -170,7 +170,10 @@ def _kept(ply: PlyPoints, viewpoint: np.ndarray | None) -> PlyPoints:
     there = np.ones(len(ply.points), dtype=bool) if ply.sigma is None else np.isfinite(ply.sigma) & (ply.sigma > 0)
     if viewpoint is not None:
         there &= np.abs(ply.points - viewpoint).max(axis=1) > FLOAT_STEP * np.abs(viewpoint).max()
-    return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None})
+    kept = ply.kept.copy()
+    kept[kept] = there
+    return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None and name != "kept"},
+                        kept=kept)
 
 
 def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, planes: LocalPlanes | None, where: str) -> _Sigma:

@@ -21,16 +21,19 @@ class TriangleMesh(NamedTuple):
     seen: np.ndarray  # [V] uint16, how many scans see each vertex
     colours: np.ndarray | None  # [V, 3] uint8, display-encoded (sRGB); None: no scan has colours
     faces: np.ndarray  # [F, 3] int32
+    invented: np.ndarray | None = None  # [V] bool, vertices that close a hole and nothing measured; None: there are none
 
 
 def write_mesh_ply(mesh: TriangleMesh, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
-    """Write a mesh as PLY whole or not at all: position, normal, `sigma`, `seen` and colour of the vertices, and the faces.
+    """Write a mesh as PLY whole or not at all: position, normal, `sigma`, `seen`, `invented` and colour of the vertices, and the
+    faces.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
     """
     coloured = COLOUR if mesh.colours is not None else ()
-    kind = np.dtype([*((name, "<f4") for name in (*POSITION, *NORMAL, "sigma")), ("seen", "<u2"), *((name, "u1") for name in coloured)])
+    kind = np.dtype([*((name, "<f4") for name in (*POSITION, *NORMAL, "sigma")), ("seen", "<u2"),
+                     *((name, "u1") for name in (*(("invented",) if mesh.invented is not None else ()), *coloured))])
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(header(kind, len(mesh.points), comments, faces=len(mesh.faces)))
         for start in range(0, len(mesh.points), BATCH):
@@ -41,6 +44,8 @@ def write_mesh_ply(mesh: TriangleMesh, path: str | Path, *, comments: tuple[str,
                     assert columns is not None
                     values[name] = columns[part, column]
             values["sigma"], values["seen"] = mesh.sigma[part], mesh.seen[part]
+            if mesh.invented is not None:
+                values["invented"] = mesh.invented[part]
             values.tofile(stream)
         face = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
         for start in range(0, len(mesh.faces), BATCH):

@@ -52,6 +52,8 @@ def _fuse(result: "FuseResult") -> None:
     else:
         print(f"holes    {holes['count']}, {1e3 * holes['open_length_m']:.4g} mm around; {holes['closed_share']:.1%} of the surface is "
               "there")
+        if closed := {kind: count for kind in ("pinholes", "holes") if (count := holes["closed"].get(kind))}:
+            print(f"closed   {' and '.join(f'{count} {kind}' for kind, count in closed.items())}")
     print_warnings(result.warnings)
 
 

@@ -20,8 +20,9 @@ from service.errors import RequestError
 from service.export.writers import WRITERS
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.register import FuseRequest
+from service.requests.register import Closing, FuseRequest
 from service.scans.fusion.boxes import boxes
+from service.scans.fusion.closing import close_holes, close_pinholes
 from service.scans.fusion.fused_bricks import SEEN_BY, FusedBricks, fused_bricks, scan_facts, short
 from service.scans.fusion.fused_surface import Surface, joined_surface, triangle_mesh, upload_layers
 from service.scans.fusion.holes import Holes, find_holes
@@ -38,6 +39,10 @@ from stage.stack.fingerprint import digest
 SLACK_VOXELS = 3.0
 """Distance, in voxels, by which the simplified mesh may lie off the surface that a view measured and still show it."""
 MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
+PINHOLE_VOXELS = 2.0
+"""Width, in voxels, up to which a hole is closed as one: thinner parts are lost and narrower gaps filled by the voxels themselves."""
+MEMBRANE_VOXELS = 2.0
+"""Length, in voxels, of the edges of membranes."""
 LISTED_HOLES = 50
 """Holes that the report lists, the longest first."""
 LOST_SHARE = 0.05
@@ -110,6 +115,10 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
     timings.stage("join", 1)
     surface = joined_surface(fused.bricks(), len(fused.used))
     _require_surface(file, len(surface.faces), fused.voxel)
+    closed: dict[str, float] = {}
+    if request.close is not Closing.NONE:
+        pinholes = close_pinholes(surface.points, surface.faces, PINHOLE_VOXELS * fused.voxel)
+        surface, closed["pinholes"] = surface.closed_by(pinholes, invented=False), pinholes.holes
     joined = None
     if request.join_normals:
         if not surface.photometric.any():
@@ -117,15 +126,22 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
                                "scans")
         timings.stage("normals", 1)
         surface, joined = with_joined_normals(surface, fused, str(file))
+    timings.stage("holes", 1)
+    holes = find_holes(surface.points, surface.faces)
+    facts = _facts(fused, surface, holes) | ({} if joined is None else {"joined_normals": joined})
+    if request.close is Closing.ALL:
+        membranes = close_holes(surface.points, surface.faces, MEMBRANE_VOXELS * fused.voxel)
+        before, surface = len(surface.points), surface.closed_by(membranes, invented=True)
+        left = find_holes(surface.points, surface.faces)
+        closed |= {"holes": membranes.holes, "vertices": len(surface.points) - before, "area_m2": short(left.area_m2 - holes.area_m2)}
+        facts |= {"vertices": len(surface.points), "faces": len(surface.faces), "watertight": left.open_edges == left.shared_edges == 0}
+    facts["holes"]["closed"] = closed
     baked = None
     if request.texture:
         timings.stage("texture", 1)
         textured = textured_mesh(surface.points, surface.faces, most_faces=request.texture_faces, texture_px=request.texture_px)
         scans = [fused.scan(place) for place in range(len(fused.used))]
         baked = textured, bake(textured.mesh, scans, fused.names, fused.voxel, request.texture_px, device=device)
-    timings.stage("holes", 1)
-    holes = find_holes(surface.points, surface.faces)
-    facts = _facts(fused, surface, holes) | ({} if joined is None else {"joined_normals": joined})
     timings.stage("write", 1)
     mesh = triangle_mesh(surface, fused.names)
     asset_path = None

@@ -21,6 +21,7 @@ from kernels.fusion.residuals import FUSED, LOST, REFUSED, residuals
 from kernels.fusion.views import LEAST_COSINE, TRUNCATION_SIGMAS, TRUNCATION_VOXELS, ViewArrays, corners_of, upload_views
 from service.asset.content.mesh import vertex_normals
 from service.scans.fusion.boxes import LEAST_VOXELS, Box, Watching, boxes
+from service.scans.fusion.closing import Closed
 from service.scans.fusion.range_images import COLOUR, NORMAL, PreparedScan, channels
 from stage.colour.colour import convert
 from stage.results.mesh import TriangleMesh
@@ -46,6 +47,20 @@ class Surface(NamedTuple):
     tallies: list["Tally"]  # one a scan
     bricks: int
     blocks: int
+    invented: np.ndarray | None = None  # [V] bool, vertices of membranes over holes; None: no hole was closed by one
+
+    def closed_by(self, closed: Closed, *, invented: bool) -> "Surface":
+        """Return the surface with what closes its holes; `invented`: nothing was measured there, and σ is not known."""
+        before, further = len(self.points), closed.system.shape[0]
+        points = closed.extended(self.points)
+        faces = np.concatenate([self.faces, closed.faces])
+        normals = np.concatenate([self.normals, _normals_of_faces(points, faces)[before:].astype(np.float32)])
+        none = np.zeros(further, dtype=bool)
+        sigma = np.concatenate([self.sigma, np.full(further, np.nan, np.float32)]) if invented else closed.extended(self.sigma)
+        seen = np.concatenate([self.seen, none.astype(np.uint16)]) if invented else closed.extended(self.seen)
+        return self._replace(points=points, normals=normals, sigma=sigma, seen=seen, faces=faces, values=closed.extended(self.values),
+                             photometric=np.concatenate([self.photometric, none]),
+                             invented=np.arange(before + further) >= before if invented else None)
 
 
 class Tally:
@@ -192,7 +207,8 @@ def triangle_mesh(surface: Surface | BrickSurface, names: tuple[str, ...]) -> Tr
         linear = np.where(weight > 0, values / np.where(weight > 0, weight, 1), 0).astype(np.float32)
         display = convert(linear[None], "lin_rec709_scene", "srgb_rec709_scene")[0] if len(linear) else linear
         colours = np.rint(np.clip(display, 0, 1) * 255).astype(np.uint8)
-    return TriangleMesh(surface.points.astype(np.float32), surface.normals, surface.sigma, surface.seen, colours, surface.faces)
+    return TriangleMesh(surface.points.astype(np.float32), surface.normals, surface.sigma, surface.seen, colours, surface.faces,
+                        surface.invented if isinstance(surface, Surface) else None)
 
 
 def centre_of(scan: PreparedScan) -> np.ndarray:
@@ -249,8 +265,7 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
            voxel: float, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the blended layers behind the normal of the vertices of a brick, their normals, whether these are photometric, and how many
     views see each."""
-    with np.errstate(invalid="ignore"):  # faces of one vertex may cancel each other
-        of_faces = np.nan_to_num(vertex_normals(triangles.points, NO_QUADS, triangles.faces))
+    of_faces = _normals_of_faces(triangles.points, triangles.faces)
     layers, feathers = upload_layers(watching, device)
     shown = gather(views, layers, feathers, *(wp.array(values, dtype=kind, device=device) for values, kind in (
         (triangles.points, wp.vec3), (of_faces, wp.vec3), (triangles.sigma, float))), vectors=3, slack=voxel, device=device)
@@ -260,6 +275,12 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1), of_faces).astype(np.float32)
     return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, shown.seen.numpy().astype(np.uint16)
+
+
+def _normals_of_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the mean normal [V, 3] of the faces around each vertex; 0 where these cancel each other."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(vertex_normals(points, NO_QUADS, faces))
 
 
 def _welded(parts: Iterable[BrickSurface], side: int) -> BrickSurface:

@@ -47,6 +47,28 @@ def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
                  float(sum(hole.length_m for hole in holes)), shared)
 
 
+def simple_chains(points: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
+    """Return the vertices of each chain around a hole, in the order of the edges of the mesh; a chain that meets itself at a vertex is cut
+    there, and one that does not close is left out."""
+    begin, finish, _ = _border(len(points), faces)
+    found = []
+    for chain, closed in _chains(begin, finish):
+        walked: list[int] = []
+        place: dict[int, int] = {}
+        for vertex in begin[chain].tolist() if closed else ():
+            if vertex in place:
+                loop = walked[place[vertex]:]
+                found.append(np.array(loop, dtype=np.int64))
+                for other in loop:
+                    del place[other]
+                del walked[-len(loop):]
+            place[vertex] = len(walked)
+            walked.append(vertex)
+        if walked:
+            found.append(np.array(walked, dtype=np.int64))
+    return found
+
+
 def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return for each face the vector along its normal that is twice as long as the face is large, [F, 3] float64."""
     first, second, third = (points[corner].astype(np.float64) for corner in faces.T)

@@ -11,19 +11,20 @@ from stage.formats.ply import COLOUR, MAX_HEADER, NORMAL, POSITION
 TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
          "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-SIGMA, CONFIDENCE = "sigma", "confidence"
+SIGMA, CONFIDENCE, INVENTED = "sigma", "confidence", "invented"
 LIST, CORNERS = "list ", ("vertex_indices", "vertex_index")
 MOST_POINTS = 2**31
 
 
 class PlyPoints(NamedTuple):
-    """The vertices of a PLY file, those with a coordinate that is not finite left out."""
+    """The vertices of a PLY file, but those with a coordinate that is not finite, and those that `relit fuse` invented to close a hole."""
 
     points: np.ndarray  # [n, 3] float64, in the unit of the file
     normals: np.ndarray | None  # [n, 3] float32, as in the file
     colours: np.ndarray | None  # [n, 3] uint8
     sigma: np.ndarray | None  # [n] float64, in the unit of the file
     confidence: np.ndarray | None  # [n] float32
+    kept: np.ndarray  # [N] bool, which vertices of the file these are
 
 
 class _Element(NamedTuple):
@@ -36,8 +37,8 @@ class _Element(NamedTuple):
 def read_ply_points(path: Path) -> PlyPoints:
     """Read the vertices of a PLY file.
 
-    These are x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma` and `confidence` where there
-    are any. Other properties and elements are skipped.
+    These are x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma`, `confidence` and `invented`
+    where there are any. Other properties and elements are skipped.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
@@ -50,9 +51,11 @@ def read_ply_points(path: Path) -> PlyPoints:
     if missing:
         raise ResultError(f"{path}: its vertices have no property {missing[0]}")
     points = np.stack([values[name].astype(np.float64) for name in POSITION], axis=1)
-    there = np.isfinite(points).all(axis=1)
+    there = np.asarray(np.isfinite(points).all(axis=1))
+    if INVENTED in values:
+        there &= values[INVENTED] == 0
     if not there.any():
-        raise ResultError(f"{path}: holds no vertex with finite coordinates")
+        raise ResultError(f"{path}: holds no measured vertex with finite coordinates")
 
     def columns(names: tuple[str, ...]) -> np.ndarray | None:
         return np.stack([values[name][there] for name in names], axis=1) if all(name in values for name in names) else None
@@ -64,13 +67,13 @@ def read_ply_points(path: Path) -> PlyPoints:
     normals, sigma, confidence = columns(NORMAL), columns((SIGMA,)), columns((CONFIDENCE,))
     return PlyPoints(points[there], None if normals is None else normals.astype(np.float32), colours,
                      None if sigma is None else sigma[:, 0].astype(np.float64),
-                     None if confidence is None else confidence[:, 0].astype(np.float32))
+                     None if confidence is None else confidence[:, 0].astype(np.float32), there)
 
 
-def read_ply_faces(path: Path, vertices: int) -> np.ndarray | None:
-    """Return the faces of a PLY file whose vertices they follow, [F, 3] int64 numbers of vertices, or None if it has none.
-    `vertices`: number of vertices that were read. Raises ResultError: it has faces that are no triangles, or of vertices that are not
-    there or were left out."""
+def read_ply_faces(path: Path, kept: np.ndarray) -> np.ndarray | None:
+    """Return the faces of a PLY file whose vertices they follow, [F, 3] int64 numbers of the `kept` [N] vertices, or None if it has none;
+    faces with a vertex that was not kept are left out. Raises ResultError: it has faces that are no triangles, or of vertices that are not
+    there."""
     with storage("read", path), open(path, "rb") as stream:
         order, elements, further, start = _header(stream, path)
         if not further or not further[0].entries:
@@ -93,9 +96,10 @@ def read_ply_faces(path: Path, vertices: int) -> np.ndarray | None:
             corners = np.column_stack([values["count"], values["at"]]).astype(np.int64)
     if len(corners) != face.entries or (corners[:, 0] != 3).any():
         raise ResultError(f"{path}: its {face.entries} faces are no triangles, or it is truncated")
-    if corners[:, 1:].min() < 0 or corners[:, 1:].max() >= elements[-1].entries or vertices != elements[-1].entries:
-        raise ResultError(f"{path}: has a face of a vertex that is not there, or vertices whose coordinates are not finite")
-    return corners[:, 1:]
+    corners = corners[:, 1:]
+    if corners.min() < 0 or corners.max() >= len(kept):
+        raise ResultError(f"{path}: has a face of a vertex that is not there")
+    return (np.cumsum(kept) - 1)[corners[kept[corners].all(axis=1)]]
 
 
 def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], list[_Element], int]:

@@ -9,7 +9,7 @@ import pytest
 from service.errors import AssetError, RequestError
 from service.requests.register import FuseRequest
 from service.scans.fusion.fuse import fuse
-from service.scans.points.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from stage.results.depth_normals import depth_normals
@@ -104,6 +104,23 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
     (warning,) = (warning for warning in result.warnings if "in common" in warning)
     assert warning.startswith("scan view 2: ")
+
+
+def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
+    file = write_scans(tmp_path, shots[::5], coloured=True)
+    measured, closed = (fuse(FuseRequest(scan_set=file, out=tmp_path / close, voxel_m=2 * VOXEL, texture=False, device="cpu", close=close))
+                        for close in ("none", "all"))
+    assert closed.facts["watertight"] and closed.facts["holes"]["count"] > 5
+    before, after, faces = read_ply_points(measured.mesh_path), read_ply_points(closed.mesh_path), read_faces(closed.mesh_path)
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    assert np.array_equal(after.points[:len(before.points)], before.points) and np.isfinite(after.sigma).all()
+    assert closed.facts["vertices"] == len(after.kept) == after.kept.sum() + closed.facts["holes"]["closed"]["vertices"]
+    assert read_ply_faces(closed.mesh_path, after.kept).max() < len(after.points)
+    corners = faces[~after.kept[faces].all(axis=1)]
+    assert len(corners) and closed.facts["holes"]["closed"]["area_m2"] > 0.01  # the statue of 1 m stood on a table that no scan saw
+    with pytest.raises(ValueError, match="close: is all, but tiles"):
+        FuseRequest(scan_set=file, out=tmp_path / "tiles", close="all", tiles=True)
 
 
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):

@@ -20,7 +20,8 @@ VOXEL = 3e-3
 def both(tmp_path_factory) -> tuple[FuseResult, FuseResult]:
     folder = tmp_path_factory.mktemp("tiles")
     file = write_scans(folder, turntable(5, (128, 96)), coloured=True)
-    made = [fuse(FuseRequest(scan_set=file, out=folder / str(tiles), voxel_m=VOXEL, texture=False, tiles=tiles, device="cpu"))
+    made = [fuse(FuseRequest(scan_set=file, out=folder / str(tiles), voxel_m=VOXEL, texture=False, tiles=tiles, close="none",
+                             device="cpu"))
             for tiles in (False, True)]
     return made[0], made[1]
 
