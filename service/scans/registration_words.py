@@ -10,7 +10,7 @@ from service.scans.registration.fixed_poses import FixedPoses
 from service.scans.registration.pairs import Evidence, Pair, PairState
 from service.scans.registration.pose_graph import REFUSED
 from service.scans.registration.registration import Registration
-from service.scans.registration.seen_through import REASON
+from service.scans.registration.seen_through import doubted_scans
 from service.scans.registration.target_pairs import TargetPlace
 
 LOOSE = 2.0
@@ -52,9 +52,7 @@ def registration_warnings(found: Registration, scans: Sequence[ScanFacts]) -> li
         out.append(f"{', '.join(scans[number].name for number in found.alike_turned)}: look much the same when they are turned about an "
                    "axis: only what sticks out tells their poses from turned ones, which may fit as well and have a small σ: look at the "
                    "result, or give targets, starts or a turntable")
-    doubted = sorted({number for pair in found.pairs if pair.reason == REASON for number in (pair.a, pair.b)
-                      if number in found.poses and not {pair.a, pair.b} <= set(found.poses)})
-    if doubted:
+    if doubted := sorted(doubted_scans(found.poses, found.pairs)):
         out.append(f"{', '.join(scans[number].name for number in doubted)}: fit scans that have no pose, from which cameras would see "
                    "through them: the object looks alike turned, and they may be turned too, with a small σ: look at the result, or give "
                    "targets, starts or a turntable")

@@ -37,7 +37,7 @@ class Closed(NamedTuple):
         """Return values [V, …] at the vertices of the mesh, with those at the further ones behind them: as smooth as can be, [V + A, …]."""
         flat = values.reshape(len(values), -1).astype(np.float64)
         further = splu(self.system).solve(self.around @ flat) if self.system.shape[0] else np.zeros((0, flat.shape[1]))
-        return np.concatenate([values, further.reshape(-1, *values.shape[1:]).astype(values.dtype)])
+        return np.concatenate([values, further.reshape(len(further), *values.shape[1:]).astype(values.dtype)])
 
 
 def close_pinholes(points: np.ndarray, faces: np.ndarray, width_m: float) -> Closed:

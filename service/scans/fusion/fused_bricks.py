@@ -23,6 +23,7 @@ from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
+from service.scans.fusion.shared_error import shared_sigma
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.sharing.sharing import digest, kind_of_worker
 from stage.formats.npy import packed, unpacked
@@ -39,6 +40,8 @@ class FusedBricks(NamedTuple):
     names: tuple[str, ...]  # the layers of all scans
     voxel: float  # metres
     places: np.ndarray  # [n, 3] int64 of each brick, in bricks from the origin, in ascending order
+    shared_sigma: float
+    """Standard deviation, metres, of what each scan errs as a whole at a place; it is in the σ of the bricks."""
     brick: Callable[[int], BrickSurface]
     """Returns the surface of the brick of a number; its tallies are those of `used`."""
     scan: Callable[[int], PreparedScan]
@@ -108,7 +111,13 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     timings.stage("fuse", max(len(places), 1))
     content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
                         advance=timings.advance)
-    return FusedBricks(summaries, placings, used, names, voxel, places, lambda number: unpacked_brick(content(f"{number:06d}")),
+    shared = shared_sigma(samples, readings, used, float(np.median([summaries[number].pitch for number in used])))
+
+    def brick(number: int) -> BrickSurface:
+        found = unpacked_brick(content(f"{number:06d}"))
+        return found._replace(sigma=np.hypot(found.sigma, shared / np.sqrt(np.maximum(found.seen, 1))).astype(np.float32))
+
+    return FusedBricks(summaries, placings, used, names, voxel, places, shared, brick,
                        lambda place: scans.with_layers(used[place], names), warnings)
 
 

@@ -24,7 +24,7 @@ from service.scans.registration.look_alikes import looks_alike_turned
 from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
-from service.scans.registration.seen_through import wrongly_joined
+from service.scans.registration.seen_through import open_pairs, wrongly_joined
 from service.scans.registration.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from stage.errors import ScanError
 from stage.sets.scan_set import Turntable
@@ -151,6 +151,11 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         wrong = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and count <= ALL_PAIRS and not told else {}
         if wrong:
             pairs |= wrong
+            solved, kept = solve_all()
+            continue
+        undecided = open_pairs(solved.poses, [*pairs.values()], len(cells)) if solved is not None and not options.accept_alike else {}
+        if undecided:
+            pairs |= undecided
             solved, kept = solve_all()
             continue
         further = most_alike(unlike, _groups(count, [*pairs.values(), *targeted.values()]))

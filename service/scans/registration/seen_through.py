@@ -15,6 +15,7 @@ from service.scans.registration.pairs import BEFORE_SETS, SEEN_THROUGH, Pair, Pa
 from service.scans.registration.pose_graph import worths
 
 REASON = "so joined, other scans would have parts where a camera saw through"
+ALIKE = "both fit scans that would be seen through so: the object looks alike turned, and nothing tells which of them are turned"
 
 
 def seen_through(a: Prepared, b: Prepared, pose: np.ndarray) -> bool:
@@ -28,6 +29,20 @@ def any_seen_through(poses: dict[int, np.ndarray], pairs: Iterable[tuple[int, in
     """Return whether the scans of any pair are seen through.
     `poses`: world_from_scan of each. `ready`: returns a scan."""
     return any(seen_through(ready(a), ready(b), inverse(poses[a]) @ poses[b]) for a, b in pairs)
+
+
+def doubted_scans(poses: dict[int, np.ndarray], pairs: Iterable[Pair]) -> set[int]:
+    """Return the scans with a pose that also fit scans without one, from which cameras would see through them: they may be turned."""
+    return {number for pair in pairs if pair.reason == REASON for number in (pair.a, pair.b)
+            if number in poses and not {pair.a, pair.b} <= set(poses)}
+
+
+def open_pairs(poses: dict[int, np.ndarray], pairs: Sequence[Pair], count: int) -> dict[tuple[int, int], Pair]:
+    """Return the joined pairs of doubted scans as ambiguous ones, if less than half of `count` scans have a pose: where most have one, they
+    tell that it is the scan without one that is turned."""
+    doubted = doubted_scans(poses, pairs) if 2 * len(poses) < count else set()
+    return {(pair.a, pair.b): pair._replace(state=PairState.AMBIGUOUS, reason=ALIKE) for pair in pairs
+            if pair.state is PairState.JOINED and {pair.a, pair.b} <= set(poses) and {pair.a, pair.b} & doubted}
 
 
 def wrongly_joined(poses: dict[int, np.ndarray], pairs: Sequence[Pair], ready: Callable[[int], Prepared]) -> dict[tuple[int, int], Pair]:

@@ -1,0 +1,47 @@
+"""What the points of a scan err alike, beside their noise: its pose, its calibration, its lens. No mean over points makes it smaller.
+
+Two scans lie apart by the noise of both and by what each errs as a whole. Noise differs from pixel to pixel; so the mean product of the
+distances at two places near each other, which share no pixel, is the variance of the rest. What all scans err alike does not show.
+"""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from service.scans.fusion.misplaced import Readings, Sample
+
+PIXELS_APART = 4.0
+"""The distance, in pixels, from which on two places share no pixel of either scan."""
+NEIGHBOURS = 16
+"""Places among which one is looked for that is far enough."""
+OTHER_SURFACE = 4.0
+"""The distance between two scans, in its robust spread, from which on they show different surfaces."""
+LEAST_PAIRS = 200
+"""Fewest pairs of places that tell; the mean of so few products is right to a tenth."""
+
+
+def shared_sigma(samples: list[Sample], readings: list[Readings], used: list[int], pixel_m: float) -> float:
+    """Return the standard deviation, metres, of what each scan errs as a whole at a place, over the `used` scans; 0 where they have too
+    little in common to tell.
+    `readings`: of each scan, as `misplaced.readings_of` returns them. `pixel_m`: distance between neighbouring pixels on the surface."""
+    firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
+    partner = np.full(firsts[-1], -1)
+    for number in used:
+        partner[firsts[number]:firsts[number + 1]] = _partners(samples[number].points, PIXELS_APART * pixel_m, firsts[number])
+    total, count = 0.0, 0
+    for other in used:
+        distance = np.full(firsts[-1], np.nan)
+        each = readings[other]
+        spread = 1.4826 * float(np.median(np.abs(each.distance))) if len(each.at) else 0.0
+        same = np.abs(each.distance) <= OTHER_SURFACE * np.maximum(each.expected, spread)
+        distance[each.at[same]] = each.distance[same]
+        products = distance[partner >= 0] * distance[partner[partner >= 0]]
+        known = np.isfinite(products)
+        total, count = total + float(products[known].sum()), count + int(known.sum())
+    return float(np.sqrt(max(total / count, 0.0) / 2)) if count >= LEAST_PAIRS else 0.0
+
+
+def _partners(points: np.ndarray, apart_m: float, first: int) -> np.ndarray:
+    """Return the nearest other point of each that is at least so far away, [n], counted from `first`; −1 where there is none."""
+    distance, at = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))
+    far = distance >= apart_m
+    return np.where(far.any(axis=1), first + at[np.arange(len(at)), far.argmax(axis=1)], -1)
