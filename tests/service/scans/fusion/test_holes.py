@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from service.comparison.surfaces import read_design, read_scanned
 from service.scans.fusion.holes import find_holes
 from service.scans.points.ply_points import read_ply_points
+from stage.errors import ResultError
 from stage.results.mesh import TriangleMesh, write_mesh_ply
 from tests.service.scans.mesh_files import read_faces
 
@@ -63,3 +65,18 @@ def test_a_mesh_is_written_as_it_is(tmp_path):
     for one, other in ((read.points, points), (read.normals, normals), (read.sigma, sigma), (read.colours, colours)):
         assert np.array_equal(one, other)
     assert np.array_equal(read_faces(tmp_path / "mesh.ply"), faces)
+
+
+def test_what_is_invented_is_left_out_where_a_mesh_is_read(tmp_path):
+    points, faces = sheet(12, 12)
+    invented = points[:, 0] > 8.5 * SIDE
+    normals = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(points), 1))
+    sigma = np.where(invented, np.nan, 1e-4).astype(np.float32)
+    path = tmp_path / "mesh.ply"
+    write_mesh_ply(TriangleMesh(points, normals, sigma, (~invented).astype(np.uint16), None, faces, invented), path)
+    scan = read_scanned(path, 1.0, None)
+    np.testing.assert_array_equal(scan.points, points[~invented])
+    assert len(scan.faces) == 2 * 8 * 12 and np.isfinite(scan.sigma).all()
+    np.testing.assert_allclose(scan.points[scan.faces].mean(axis=1)[:, 0].max(), (7 + 2 / 3) * SIDE, rtol=1e-6)
+    with pytest.raises(ResultError, match="invented to close holes"):
+        read_design(path, 1.0, device="cpu")
