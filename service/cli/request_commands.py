@@ -25,7 +25,9 @@ results by the role of the field.
 """
 
 import inspect
+import os
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from enum import Enum
 from functools import partial
 from importlib import import_module
@@ -35,10 +37,24 @@ from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 import typer
 from pydantic import BeforeValidator, ValidationError
 
-from service.cli.colours import OcioOption, colours
 from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
+from stage.colour.location import VARIABLE
+
+OcioOption = Annotated[str | None, typer.Option(
+    "--ocio", metavar="FILE|ocio://…", show_default=False,
+    help="OpenColorIO configuration whose colour spaces the images have; without it that of $OCIO, else ocio://default.")]
+
+
+def colours(place: str | None) -> AbstractContextManager[None]:
+    """Return the context of a command: the configuration of colours that --ocio or $OCIO names, checked before any work."""
+    if place is None and not os.environ.get(VARIABLE):
+        return nullcontext()
+    from stage.colour.configuration import used  # which loads an image library
+
+    return used(place)
+
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
@@ -81,12 +97,15 @@ def local_command(group: typer.Typer, name: str, function: Callable[..., None]) 
     command(group, name, function, local=True)
 
 
-def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[[Any], None]) -> None:
-    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result."""
+def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[..., None]) -> None:
+    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result.
+    `show`: takes the result and, where it has two parameters, the request."""
+    with_request = len(inspect.signature(show).parameters) > 1
 
     def run(request: model) -> None:  # type: ignore[valid-type]
         module, _, function = product.partition(":")
-        show(with_bar(getattr(import_module(module), function), request))
+        result = with_bar(getattr(import_module(module), function), request)
+        show(result, request) if with_request else show(result)
 
     local_command(group, name, run)
 
@@ -181,4 +200,3 @@ def _typer_type(annotation: Any) -> Any:
     if is_document(annotation):
         return Path  # a JSON file that holds it
     return annotation if isinstance(annotation, type) and issubclass(annotation, READ_BY_TYPER) else str
-
