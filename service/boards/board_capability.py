@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.tables import rounded, table_text
+from service.boards.findings import rounded, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import BoardCapabilityRequest

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from service.boards.tables import six_digits, table_text
+from service.boards.findings import six_digits, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import GaugeBoardRequest

@@ -25,9 +25,7 @@ results by the role of the field.
 """
 
 import inspect
-import os
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from enum import Enum
 from functools import partial
 from importlib import import_module
@@ -37,24 +35,10 @@ from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 import typer
 from pydantic import BeforeValidator, ValidationError
 
+from service.cli.colours import OcioOption, colours
 from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
-from stage.colour.location import VARIABLE
-
-OcioOption = Annotated[str | None, typer.Option(
-    "--ocio", metavar="FILE|ocio://…", show_default=False,
-    help="OpenColorIO configuration whose colour spaces the images have; without it that of $OCIO, else ocio://default.")]
-
-
-def colours(place: str | None) -> AbstractContextManager[None]:
-    """Return the context of a command: the configuration of colours that --ocio or $OCIO names, checked before any work."""
-    if place is None and not os.environ.get(VARIABLE):
-        return nullcontext()
-    from stage.colour.configuration import used  # which loads an image library
-
-    return used(place)
-
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
