@@ -22,8 +22,6 @@ BOARD_FILE = "board.exr"
 HEIGHT, SIGMA, NOISE, MASK = "height.Z", "sigma.Z", "noise.Z", "mask.Y"
 LEAST_SHARE = 0.5
 """The least part of either map that the other must cover."""
-LEAST_SCALE = 0.5
-"""Heights whose scale against the nominal ones is below this, or above its inverse, have another unit."""
 LEAST_MIRRORED = 0.8
 """A board is mirrored if its mirror image correlates so well with the nominal map, and itself not."""
 
