@@ -20,9 +20,8 @@ MOST_SHOWN = 60
 """The most characters of a value or a key that a sentence repeats."""
 
 
-def read_record(path: str | Path, model: type[Record], schema: str, further: Callable[[dict[str, Any]], Iterator[str]] | None = None
-                ) -> Record:
-    """Read a JSON file and check it against a model.
+def read_record(path: str | Path, model: type[Record], further: Callable[[dict[str, Any]], Iterator[str]] | None = None) -> Record:
+    """Read a JSON file and check it against a model, whose key `schema` it must have.
     `further`: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report because it
     stops at the first fault of a long list."""
     text = inputs.read_bytes(path)
@@ -38,6 +37,7 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
         raise ManifestError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
+    schema = schema_of(model)
     if "schema" not in data:
         raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
     if data["schema"] != schema:

@@ -143,7 +143,7 @@ class Manifest(Strict):
 
 def read_manifest(path: str | Path) -> Manifest:
     """Read and check a capture.json."""
-    return read_record(path, Manifest, SCHEMA, _frame_faults)
+    return read_record(path, Manifest, _frame_faults)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:

@@ -206,7 +206,7 @@ class Rig(Strict):
 
 def read_rig(path: str | Path) -> Rig:
     """Read and check a rig file."""
-    return read_record(path, Rig, RIG_SCHEMA, _lamp_faults)
+    return read_record(path, Rig, _lamp_faults)
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:

@@ -13,7 +13,7 @@ from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, St
 from stage.records import faults_of_each, read_record
 from stage.transforms import ROTATION_ROUNDING, Row, off_rotation, rigid_fault, rotation_about
 
-SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
+SCAN_SET_FILE = "scan-set.json"
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
 """The length of each unit that a point set may have, in metres."""
 SYMMETRIC = 1e-6
@@ -159,7 +159,7 @@ class ScanSet(Strict):
 def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
     """Read and check a scan-set.json; `path`: the file, or the folder with it."""
     file = path / SCAN_SET_FILE if path.is_dir() else path
-    return file, read_record(file, ScanSet, SCAN_SET_SCHEMA, _faults)
+    return file, read_record(file, ScanSet, _faults)
 
 
 def write_scan_set(scans: ScanSet, path: Path) -> None:
