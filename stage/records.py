@@ -54,6 +54,14 @@ def schema_of(model: type[BaseModel]) -> str:
     return str(get_args(model.model_fields["schema_"].annotation)[0])
 
 
+def record_text(record: BaseModel, rows: str, **always: object) -> str:
+    """Return the JSON of a record without what has its default, but for `always`; each of its list `rows` has a line, at the end."""
+    data = record.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+    lines = ",\n".join("    " + json.dumps(row) for row in data.pop(rows))
+    head = {"schema": data.pop("schema"), "name": data.pop("name"), **always, **data}
+    return json.dumps(head, indent=2)[:-2] + f',\n  "{rows}": [\n{lines}\n  ]\n}}\n'
+
+
 def describe(error: ValidationError, name: FieldName | None = None) -> str:
     """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults."""
     faults = faults_of(error, name)

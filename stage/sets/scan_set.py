@@ -1,6 +1,5 @@
 """The file of a scan set, scan-set.json with schema relit.scan-set/1: range images and point sets of one object, with or without poses."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -10,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
-from stage.records import faults_of_each, read_record
+from stage.records import faults_of_each, read_record, record_text
 from stage.transforms import ROTATION_ROUNDING, Row, off_rotation, rigid_fault, rotation_about
 
 SCAN_SET_FILE = "scan-set.json"
@@ -164,10 +163,7 @@ def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
 
 def write_scan_set(scans: ScanSet, path: Path) -> None:
     """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default."""
-    data = scans.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    entries = ",\n".join("    " + json.dumps(entry) for entry in data.pop("scans"))
-    body = json.dumps({"schema": data.pop("schema"), "name": data.pop("name"), **data}, indent=2)
-    write_text(path, body[:-2] + f',\n  "scans": [\n{entries}\n  ]\n}}\n')
+    write_text(path, record_text(scans, "scans"))
 
 
 def rotation_warnings(scans: ScanSet) -> list[str]:
