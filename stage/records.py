@@ -20,9 +20,8 @@ MOST_SHOWN = 60
 """The most characters of a value or a key that a sentence repeats."""
 
 
-def read_record(path: str | Path, model: type[Record], schema: str, further: Callable[[dict[str, Any]], Iterator[str]] | None = None
-                ) -> Record:
-    """Read a JSON file and check it against a model.
+def read_record(path: str | Path, model: type[Record], further: Callable[[dict[str, Any]], Iterator[str]] | None = None) -> Record:
+    """Read a JSON file and check it against a model, whose key `schema` it must have.
     `further`: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report because it
     stops at the first fault of a long list."""
     text = inputs.read_bytes(path)
@@ -38,6 +37,7 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
         raise ManifestError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
+    schema = schema_of(model)
     if "schema" not in data:
         raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
     if data["schema"] != schema:
@@ -52,6 +52,14 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
 def schema_of(model: type[BaseModel]) -> str:
     """Return the value that the key `schema` of a model's files must have."""
     return str(get_args(model.model_fields["schema_"].annotation)[0])
+
+
+def record_text(record: BaseModel, rows: str, **always: object) -> str:
+    """Return the JSON of a record without what has its default, but for `always`; each of its list `rows` has a line, at the end."""
+    data = record.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+    lines = ",\n".join("    " + json.dumps(row) for row in data.pop(rows))
+    head = {"schema": data.pop("schema"), "name": data.pop("name"), **always, **data}
+    return json.dumps(head, indent=2)[:-2] + f',\n  "{rows}": [\n{lines}\n  ]\n}}\n'
 
 
 def describe(error: ValidationError, name: FieldName | None = None) -> str:

@@ -84,7 +84,7 @@ def test_the_imports_are_read():
     """If this fails, the others prove nothing."""
     assert len(FILES) > 60
     assert Import("service.solve.solve", "stage.capture.capture.Capture", False) in imports()
-    assert Import("service.cli.commands.solve", "service.solve.solve.solve", True) in imports()
+    assert Import("service.cli.commands.captures", "service.solve.solve.solve", True) in imports()
     assert any(i.importer == "kernels.device" and i.target == "warp" for i in imports())
 
 

@@ -59,17 +59,6 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
     return band_of(values.reshape(count * channels, pixels), saturated, frame_count=count, device=device)
 
 
-def stack(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Return images of one size, [rows, cols] or [rows, cols, channels], as `upload` takes them: [frames, (channels,) pixels] float32."""
-    if not images:
-        raise ArrayError("there are no images: give one a frame")
-    for index, image in enumerate(images):
-        if image.shape != images[0].shape or image.ndim not in (2, 3):
-            raise ArrayError(f"image {index} is {image.shape}, image 0 is {images[0].shape}: give images of one size")
-    flat = np.stack([image.reshape(image.shape[0] * image.shape[1], -1).T for image in images]).astype(np.float32)
-    return np.ascontiguousarray(flat[:, 0] if images[0].ndim == 2 else flat)
-
-
 def saturated_bits(saturated: np.ndarray) -> np.ndarray:
     """Return [⌈frames / 8⌉, pixels] uint8 bits of [frames, pixels] bool."""
     return np.packbits(np.pad(saturated, ((0, -len(saturated) % 8), (0, 0))), axis=0, bitorder="little")

@@ -12,8 +12,6 @@ import warp as wp
 from kernels import device as devices
 from kernels.surface.grid import Grid
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Runs(NamedTuple):
     """Unbroken stretches of usable pixels, row by row."""

@@ -19,8 +19,6 @@ from kernels.surface.grid import EdgeWeights, Grid, Summer, Walk, end_cell, firs
 from kernels.surface.multigrid import Multigrid
 from kernels.surface.slopes import Slopes
 
-wp.set_module_options({"enable_backward": False})
-
 CHECK_EVERY = 4
 """Number of iterations between two readings of the residual on CUDA, where each reading waits for the device. It is even, so that their
 graph ends in the slot in which it begins."""

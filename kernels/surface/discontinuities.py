@@ -27,8 +27,6 @@ from kernels.surface.normal_map import NormalMap
 from kernels.surface.parts import assemble, connect
 from kernels.surface.slopes import Slopes
 
-wp.set_module_options({"enable_backward": False})
-
 LEAST_TRUST = 1.0e-5
 """Part of its weight that an edge across a break keeps, so that a part that is broken off all around keeps some depth."""
 LEAST_LOOP = 0.01

@@ -14,8 +14,6 @@ import warp as wp
 
 from kernels import device as devices
 
-wp.set_module_options({"enable_backward": False})
-
 CPU_RUN = 8192
 """Number of cells that one CPU thread takes in a row: 32 KB of float32, so that the cost of starting a thread is negligible."""
 BRIEF_RUNS = 16

@@ -23,8 +23,6 @@ from kernels import device as devices
 from kernels.device import Recorded
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, make_grid, record
 
-wp.set_module_options({"enable_backward": False})
-
 COARSEST = 2
 """Side, in pixels, of the coarsest level: smoothing alone solves it."""
 BRIEF_CELLS = 8191

@@ -12,8 +12,6 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Nearest(NamedTuple):
     """The nearest point of a mesh to each of n points, on the host."""

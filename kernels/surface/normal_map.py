@@ -23,8 +23,6 @@ import warp as wp
 
 from kernels import device as devices
 
-wp.set_module_options({"enable_backward": False})
-
 HALF = 0.17453293
 """Standard error, radians (ten degrees), at which the weight of a pair is halved. Between 5° and 20° heights differ by a thirtieth of their
 error."""
@@ -80,8 +78,6 @@ def supported_normals(
     devices.launch(_support, sigma.shape[0] * sigma.shape[1], [normal, sigma, x, y, float(perspective)], list(found), device=device)
     return found
 
-
-wp.set_module_options({"enable_backward": False})
 
 SHORTEST_NORMAL = 0.5
 """Least length of a vector that counts as a normal: half storage shortens one by 0.001, and an unsolved pixel holds zeros."""

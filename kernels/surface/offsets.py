@@ -41,8 +41,6 @@ from kernels.surface.shadows import (
     surface_point,
 )
 
-wp.set_module_options({"enable_backward": False})
-
 OUTLINE_0, OUTLINE_1, OUTLINE_2 = 1.875, -1.25, 0.375
 """Weights of the last three gaps for that at the outline, which lies half a step farther on in the mean: the parabola through them. Flat
 parts have their largest and smallest gaps there; round ones have them elsewhere, and are too steep at the outline."""

@@ -32,8 +32,6 @@ from kernels.device import once
 from kernels.surface.grid import EdgeWeights, Grid
 from kernels.surface.normal_map import NormalMap
 
-wp.set_module_options({"enable_backward": False})
-
 STEEPEST = 0.02
 """Cosine of the steepest usable tilt, 88.9°: that of the rim of a sphere of 2500 pixels radius, which normals do not resolve."""
 

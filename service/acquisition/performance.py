@@ -14,7 +14,7 @@ from service.acquisition.checks.picture_sample import sample_of
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import FLAT, TRACKING, Shot, shots_of
 from service.errors import RequestError
-from service.requests.imports.interleaved import InterleavedImport
+from service.requests.imports.patterns import InterleavedImport
 from stage.capture.light import FullLight, GradientLight
 from stage.capture.sequence import FRAME_RATE, SEQUENCE_FILE, TimeStep, write_sequence
 from stage.capture.sequence import Sequence as CaptureSequence

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.tables import rounded, table_text
+from service.boards.findings import rounded, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import BoardCapabilityRequest
@@ -19,7 +19,7 @@ from stage import inputs
 from stage.errors import BoardError, ManifestError
 from stage.files import write_text
 from stage.records import read_record
-from stage.sets.board import STUDY_SCHEMA, GaugeRuns
+from stage.sets.board import GaugeRuns
 from stage.stack.fingerprint import digest
 
 CAPABILITY_FILE = "capability.csv"
@@ -65,7 +65,7 @@ class BoardCapabilityResult(NamedTuple):
 def board_capability(request: BoardCapabilityRequest, progress: Progress | None = None) -> BoardCapabilityResult:
     """Find the capability of every pad or region that has limits; several runs of a board count as their mean."""
     timings = Timings(progress)
-    runs = read_record(request.study, GaugeRuns, STUDY_SCHEMA)
+    runs = read_record(request.study, GaugeRuns)
     timings.stage("read", len(runs.runs))
     values: dict[Value, dict[str, list[float]]] = {}
     limits: dict[Value, Limits] = {}

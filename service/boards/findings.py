@@ -1,6 +1,8 @@
-"""The rows that an inspection lists: defects, regions, and areas that were not inspected."""
+"""The rows that an inspection lists: defects, regions, and areas that were not inspected; and tables of boards as CSV."""
 
-from collections.abc import Iterator, Sequence
+import csv
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +11,26 @@ from scipy.ndimage import find_objects, label
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import RegionResult
 from service.boards.stitching.significance import Scan, grown, mean_of, region_of, weighted_centre
-from service.boards.tables import rounded, table_text
+
+
+def table_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return rows under their columns as CSV; a column that a row lacks is empty."""
+    out = io.StringIO()
+    table = csv.DictWriter(out, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return out.getvalue()
+
+
+def six_digits(value: float) -> float:
+    """Return a number rounded to six digits."""
+    return float(f"{value:.6g}")
+
+
+def rounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values whose floats have six digits."""
+    return {key: six_digits(value) if isinstance(value, float) else value for key, value in values.items()}
+
 
 FINDINGS_FILE = "findings.csv"
 MOST_AREAS = 1000

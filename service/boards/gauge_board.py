@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from service.boards.tables import six_digits, table_text
+from service.boards.findings import six_digits, table_text
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import GaugeBoardRequest
@@ -21,7 +21,7 @@ from stage import inputs
 from stage.errors import BoardError, ManifestError
 from stage.files import write_text
 from stage.records import read_record
-from stage.sets.board import STUDY_SCHEMA, GaugeRuns
+from stage.sets.board import GaugeRuns
 from stage.stack.fingerprint import digest
 
 GAUGE_FILE = "gauge.csv"
@@ -98,7 +98,7 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
     A part of the study is a region of a board; its values are the deviations from the nominal height.
     """
     timings = Timings(progress)
-    runs = read_record(request.study, GaugeRuns, STUDY_SCHEMA)
+    runs = read_record(request.study, GaugeRuns)
     timings.stage("read", len(runs.runs))
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for number, run in enumerate(runs.runs, start=1):

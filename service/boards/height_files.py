@@ -16,14 +16,12 @@ from stage.errors import BoardError, ManifestError, ResultError
 from stage.formats import exr
 from stage.records import read_record
 from stage.results.result_metadata import camera_and_provenance, result_metadata
-from stage.sets.board import DESIGN_SCHEMA, REGIONS_SCHEMA, BoardDesign, BoardRegions, Region
+from stage.sets.board import BoardDesign, BoardRegions, Region
 
 BOARD_FILE = "board.exr"
 HEIGHT, SIGMA, NOISE, MASK = "height.Z", "sigma.Z", "noise.Z", "mask.Y"
 LEAST_SHARE = 0.5
 """The least part of either map that the other must cover."""
-LEAST_SCALE = 0.5
-"""Heights whose scale against the nominal ones is below this, or above its inverse, have another unit."""
 LEAST_MIRRORED = 0.8
 """A board is mirrored if its mirror image correlates so well with the nominal map, and itself not."""
 
@@ -60,14 +58,14 @@ def read_golden(path: Path, regions: Path | None = None) -> Nominal:
         raise ResultError(f"{file}: {error}") from error
     judged: tuple[Region, ...] = ()
     if regions is not None:
-        judged = read_record(regions, BoardRegions, REGIONS_SCHEMA).regions
+        judged = read_record(regions, BoardRegions).regions
         _check_places(regions, judged, grid)
     return Nominal(file, file.parent.name, _heights(file, channels, grid), judged)
 
 
 def read_design(path: Path) -> Nominal:
     """Read a design: its JSON file and the height map that it names, which has the size that the file says."""
-    design = read_record(path, BoardDesign, DESIGN_SCHEMA)
+    design = read_record(path, BoardDesign)
     file = path.parent / design.height_map.path
     channels, _ = exr.read(file)
     shape = next(iter(channels.values())).shape

@@ -11,6 +11,7 @@ import numpy as np
 
 from kernels import device as devices
 from service.boards.datum import Datum, find_mark, fit_datum, lay
+from service.boards.findings import six_digits, table_text
 from service.boards.height_files import BOARD_FILE, write_board
 from service.boards.inspect_board import stitch_board, stitching_entries
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
@@ -19,7 +20,6 @@ from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
 from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend
-from service.boards.tables import six_digits, table_text
 from service.boards.tiles import BoardTiles, read_tiles
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report

@@ -15,7 +15,7 @@ from stage.capture.manifest import FILE_NAME
 from stage.errors import BoardError, ManifestError
 from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
-from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
+from stage.sets.board import SCAN_FILE, BoardScan, Tile
 
 SPIKE = 6.0
 """σ beyond its neighbours from which on a point is an outlier."""
@@ -41,7 +41,7 @@ def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: 
     """Read a board.json, or that in a folder, and all of its tiles; captures are decoded on the device, with their image stacks in the
     folder `cache`, or beside each where it is None."""
     file = path / SCAN_FILE if path.is_dir() else path
-    scan = read_record(file, BoardScan, SCAN_SCHEMA)
+    scan = read_record(file, BoardScan)
     progress.stage("tiles", len(scan.tiles))
     tiles, contents = [], {}
     for number, tile in enumerate(scan.tiles):

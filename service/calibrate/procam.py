@@ -2,22 +2,21 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
-from service.calibrate.results import digits, manifests_to_replace, write_results
+from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
-from service.calibrate.solvers.procam import BoardView, Lens, ProCam, calibrate, outliers, projector_corners
+from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
 from service.requests.depth import DepthRequest
-from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest
 from stage.capture.projector import Projector
@@ -146,7 +145,7 @@ def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ..
     left = [{"view": name, "remark": remark} for name, remark in remarks.items() if name not in used]
     baseline = float(np.linalg.norm(found.camera_from_projector[:3, 3]))
     section = {"captures": [str(path) for path in request.captures], "rms_px": float(f"{found.rms_px:.4g}"),
-               "baseline_m": float(f"{baseline:.6g}"), "camera": _entry(found.camera), "projector": _entry(found.projector),
+               "baseline_m": float(f"{baseline:.6g}"), "camera": lens_facts(found.camera), "projector": lens_facts(found.projector),
                "views": entries, "left_out": left}
     reports = [write_results("procam", request, _updated(capture.manifest, found, size), path, section)
                for capture, path in zip(targets, paths, strict=True)]
@@ -158,20 +157,10 @@ def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ..
 
 
 def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:
-    """Return the manifest with camera and projector; the camera's place in the world and the projector's radiometry stay."""
-    old = manifest.camera
-    surface = old.surface_z_m if old.projection == "perspective" else None
-    camera = Camera(projection="perspective", resolution=old.resolution, focal_px=found.camera.focal,
-                    principal_px=found.camera.principal, distortion=found.camera.distortion, surface_z_m=surface,
-                    world_from_camera=old.world_from_camera)
+    """Return the manifest with camera and projector, whose radiometry stays."""
     before = manifest.projector
     projector = Projector.model_validate({
         "resolution": size, "focal_px": found.projector.focal, "principal_px": found.projector.principal,
         "distortion": found.projector.distortion, "camera_from_projector": found.camera_from_projector.tolist(),
         **({} if before is None else {"response": before.response, "crosstalk": before.crosstalk})})
-    return manifest.model_copy(update={"camera": camera, "projector": projector})
-
-
-def _entry(lens: Lens) -> dict[str, Any]:
-    return {"focal_px": digits(lens.focal), "principal_px": digits(lens.principal), "k": digits(lens.distortion.k),
-            "p": digits(lens.distortion.p), "rms_alone_px": float(f"{lens.rms_px:.4g}")}
+    return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, found.camera), "projector": projector})

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.calibrate.solvers.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
+from service.calibrate.solvers.procam import Lens
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import reported_versions, requested, with_names
 from service.requests.base.base import Options
 from service.requests.calibrate import FramesRequest, LightsRequest, ResponseRequest, SaturationRequest
+from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, ColorMatrix, Manifest, write_manifest
 from stage.errors import CalibrationError
@@ -145,6 +147,19 @@ def write_report(kind: str, request: Options, folder: Path, section: dict[str, A
 def manifests_to_replace(captures: Iterable[Capture], chosen: Sequence[Path] | None) -> tuple[Path, ...]:
     """Return the manifest to write for each capture: those that are chosen, one for each; None: their own."""
     return tuple(capture.folder / FILE_NAME for capture in captures) if chosen is None else tuple(chosen)
+
+
+def lens_facts(lens: Lens) -> dict[str, Any]:
+    """Return a lens as the report has it."""
+    return {"focal_px": digits(lens.focal), "principal_px": digits(lens.principal), "k": digits(lens.distortion.k),
+            "p": digits(lens.distortion.p), "rms_alone_px": float(f"{lens.rms_px:.4g}")}
+
+
+def calibrated_camera(old: Camera, lens: Lens) -> Camera:
+    """Return a camera with a lens that was calibrated; its place in the world and the height of its surface stay."""
+    return Camera(projection="perspective", resolution=old.resolution, focal_px=lens.focal, principal_px=lens.principal,
+                  distortion=lens.distortion, surface_z_m=old.surface_z_m if old.projection == "perspective" else None,
+                  world_from_camera=old.world_from_camera)
 
 
 def digits(values: Iterable[float]) -> list[float]:

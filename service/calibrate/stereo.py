@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from service.calibrate.results import digits, manifests_to_replace, write_results
+from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import LEAST_VIEWS, LENS_FLAGS, Lens, board_points, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
-from stage.capture.camera import Camera, OtherCamera
+from stage.capture.camera import OtherCamera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest
 from stage.colour.colour import GREY_WEIGHTS, linearise
@@ -199,10 +199,10 @@ def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ..
         errors = list(zip(pose.first_error_px, pose.other_error_px, strict=True))
         rows += [(view.name, other.name, f"{first:.3f}", f"{second:.3f}", "stands out" if max(first, second) > MOST_ERROR_PX else "")
                  for view, (first, second) in zip(views, errors, strict=True)]
-        entries.append({"name": other.name, **_entry(lens), "rms_px": float(f"{pose.rms_px:.4g}"), "baseline_m": _baseline(pose),
+        entries.append({"name": other.name, **lens_facts(lens), "rms_px": float(f"{pose.rms_px:.4g}"), "baseline_m": _baseline(pose),
                         "views": [{"frame": view.name, "camera_px": float(f"{first:.4g}"), "other_px": float(f"{second:.4g}")}
                                   for view, (first, second) in zip(views, errors, strict=True)]})
-    section = {"capture": str(request.capture), "camera": _entry(lenses[0]), "other_cameras": entries}
+    section = {"capture": str(request.capture), "camera": lens_facts(lenses[0]), "other_cameras": entries}
     reports = [write_results("stereo", request, _updated(target.manifest, lenses, poses), path, section)
                for target, path in zip(targets, paths, strict=True)]
     summary = ", ".join(f"{other.name}: {pose.rms_px:.3f} px RMS, baseline {_baseline(pose):.4f} m"
@@ -215,18 +215,9 @@ def _baseline(pose: StereoPose) -> float:
 
 
 def _updated(manifest: Manifest, lenses: list[Lens], poses: list[StereoPose]) -> Manifest:
-    """Return the manifest with all cameras; the camera's place in the world and the height of its surface stay."""
-    old, first = manifest.camera, lenses[0]
-    surface = old.surface_z_m if old.projection == "perspective" else None
-    camera = Camera(projection="perspective", resolution=old.resolution, focal_px=first.focal, principal_px=first.principal,
-                    distortion=first.distortion, surface_z_m=surface, world_from_camera=old.world_from_camera)
+    """Return the manifest with all cameras."""
     others = tuple(OtherCamera.model_validate({
         "name": other.name, "resolution": other.resolution, "focal_px": lens.focal, "principal_px": lens.principal,
         "distortion": lens.distortion, "camera_from_other": pose.camera_from_other.tolist()})
         for other, lens, pose in zip(manifest.other_cameras, lenses[1:], poses, strict=True))
-    return manifest.model_copy(update={"camera": camera, "other_cameras": others})
-
-
-def _entry(lens: Lens) -> dict[str, Any]:
-    return {"focal_px": digits(lens.focal), "principal_px": digits(lens.principal), "k": digits(lens.distortion.k),
-            "p": digits(lens.distortion.p), "rms_alone_px": float(f"{lens.rms_px:.4g}")}
+    return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, lenses[0]), "other_cameras": others})

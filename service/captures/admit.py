@@ -18,7 +18,7 @@ from stage.formats.npy import array_shape
 from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE
 from stage.sets.board import SCAN_FILE as BOARD_FILE
-from stage.sets.board import SCAN_SCHEMA, BoardScan
+from stage.sets.board import BoardScan
 from stage.tof.scan import FILE_NAME as SCAN_FILE
 from stage.tof.scan import read_scan
 
@@ -71,7 +71,7 @@ def calibrations_of(capture: Capture) -> list[str]:
 def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:
     """Check the tiles of a board as `admit_capture` checks captures."""
     _check_place(folder / BOARD_FILE, folder, BOARD_FILE)
-    scan = read_record(folder / BOARD_FILE, BoardScan, SCAN_SCHEMA)
+    scan = read_record(folder / BOARD_FILE, BoardScan)
     for number, tile in enumerate(scan.tiles):
         place = folder / tile.path
         if (depth := place / DEPTH_FILE).exists() or depth.is_symlink():

@@ -10,6 +10,7 @@ and at last {"facts": …}, {"error": sentence} or {"fault": traceback}.
 
 import json
 import os
+import resource
 import selectors
 import signal
 import subprocess
@@ -22,10 +23,32 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from service.captures.processes import bare_environment, limit
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.reporting.progress import Progress
 from service.requests.base.import_choices import ImportChoices
+from stage.colour.location import VARIABLE, location
+
+KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH", VARIABLE)
+"""Variables of the environment that such a process inherits."""
+
+
+def bare_environment() -> dict[str, str]:
+    """Return an environment without the settings of the service, in which Python finds the same modules."""
+    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
+    if VARIABLE in kept:
+        kept[VARIABLE] = location()
+    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
+    return kept | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def limit(**most: int) -> None:
+    """Set limits of this process, by the names of `resource` without RLIMIT_: bytes or seconds. It writes no core file."""
+    for name, wanted in (most | {"CORE": 0}).items():
+        kind = getattr(resource, f"RLIMIT_{name}")
+        _, hard = resource.getrlimit(kind)
+        allowed = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(kind, (allowed, allowed))
+
 
 MEMORY_BYTES = 2 << 30
 """Bytes of data that a check may have; the largest capture.json takes a third."""

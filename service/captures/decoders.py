@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from service.captures.processes import bare_environment, limit
+from service.captures.check_process import bare_environment, limit
 from stage import inputs
 from stage.errors import ImageError, StageError
 from stage.formats import images

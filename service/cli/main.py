@@ -18,7 +18,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "info": ("captures", "Say what a capture holds, and what is wrong with it."),
     "view": ("captures", "Write the files that a browser needs to show a capture, its maps, its object under new light, and its "
              "depth as points."),
-    "solve": ("solve", "Normals, albedo and height of a light-stage capture."),
+    "solve": ("captures", "Normals, albedo and height of a light-stage capture."),
+    "relight": ("captures", "Frames under HDR environments and animated lights."),
+    "shade": ("captures", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
     "export": ("export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
     "blender-extension": ("export", "Write the extension that brings Relit into Blender 4.2 and later; Blender's preferences install it "
                           "from the file."),
@@ -42,11 +44,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),
     "compare": ("scans", "Compare a scan with the design of the part: its deviations with their σ, and whether regions are within their "
                 "tolerances."),
-    "relight": ("light", "Frames under HDR environments and animated lights."),
-    "shade": ("light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
     "drive": ("rig", "Levels at which the lamps of a rig light a subject as environments and animated lights would."),
-    "play": ("stage", "Send cues to the lamps of a rig over sACN or Art-Net, and turn the lamps dark at the end."),
-    "twin": ("stage", "A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."),
+    "play": ("rig", "Send cues to the lamps of a rig over sACN or Art-Net, and turn the lamps dark at the end."),
+    "twin": ("rig", "A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."),
     "capture": ("acquire", "Take a capture: switch each light or show each pattern, take the picture, check it, and write the capture "
                 "folder as it goes. Given again, the command takes the pictures that are missing."),
     "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "

@@ -81,12 +81,15 @@ def local_command(group: typer.Typer, name: str, function: Callable[..., None]) 
     command(group, name, function, local=True)
 
 
-def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[[Any], None]) -> None:
-    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result."""
+def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[..., None]) -> None:
+    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result.
+    `show`: takes the result and, where it has two parameters, the request."""
+    with_request = len(inspect.signature(show).parameters) > 1
 
     def run(request: model) -> None:  # type: ignore[valid-type]
         module, _, function = product.partition(":")
-        show(with_bar(getattr(import_module(module), function), request))
+        result = with_bar(getattr(import_module(module), function), request)
+        show(result, request) if with_request else show(result)
 
     local_command(group, name, run)
 
@@ -181,4 +184,3 @@ def _typer_type(annotation: Any) -> Any:
     if is_document(annotation):
         return Path  # a JSON file that holds it
     return annotation if isinstance(annotation, type) and issubclass(annotation, READ_BY_TYPER) else str
-

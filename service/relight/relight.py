@@ -17,14 +17,13 @@ from service.relight.attributes import time_attributes
 from service.relight.clipping import Clipping
 from service.relight.combine import chunk_frames, linear_frames, row_blocks
 from service.relight.findings import FrameFindings, MatteFindings
-from service.relight.groups import add_up, in_groups
 from service.relight.guide import Guide
 from service.relight.layers import frame_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, FrameLight, ModelUse
 from service.relight.nuke import write_nuke_script
 from service.relight.opened_capture import OpenedCapture, open_capture
 from service.relight.outputs import REQUEST_ATTRIBUTE, display_path, frame_hashes, is_complete
-from service.relight.plan import Plan, PlannedFrame, make_plan
+from service.relight.plan import Plan, PlannedFrame, add_up, in_groups, make_plan
 from service.relight.sheet import contact_sheet, display_frame
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings

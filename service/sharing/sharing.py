@@ -11,7 +11,6 @@ pixels of its own, and no piece reads what another found: so results are the sam
 
 import dataclasses
 import hashlib
-import io
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -24,6 +23,7 @@ from kernels import device as devices
 from kernels.relight.frames import cublas
 from service.errors import DivergedError
 from service.reporting.provenance import versions
+from stage.formats.npy import packed, unpacked
 
 # Storage in which the workers of one job keep their pieces, and the check that they work at the same job.
 LOOK_S = 0.2
@@ -190,7 +190,8 @@ class _Pass:
 
     def read(self, number: int, pixels: Any) -> bool:
         """Take over what another worker has found in a piece; return False if it is not there."""
-        found = _unpacked(self._store.read(self._file(number)))
+        content = opened(self._store.read(self._file(number)))
+        found = None if content is None else list(unpacked(content).values())
         places = [array[..., pixels] for array in self._arrays]
         if found is None or [(a.shape, a.dtype) for a in found] != [(a.shape, a.dtype) for a in places]:
             return False
@@ -206,7 +207,8 @@ class _Pass:
 
     def write(self, number: int, pixels: Any) -> None:
         """Give the others what this worker has found in a piece."""
-        self._store.write(self._file(number), _packed([array[..., pixels] for array in self._arrays]))
+        found = {str(place): array[..., pixels] for place, array in enumerate(self._arrays)}
+        self._store.write(self._file(number), sealed(packed(found)))
 
     def _file(self, number: int) -> str:
         return f"{self._folder}/{number:05d}"
@@ -243,17 +245,3 @@ def _add(value: object, add: Callable[[bytes], None]) -> None:
         _add([(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)], add)
     else:
         raise TypeError(f"the content of a {type(value).__name__} is not known")
-
-
-def _packed(arrays: Sequence[np.ndarray]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, *arrays, allow_pickle=False)
-    return sealed(buffer.getvalue())
-
-
-def _unpacked(stored: bytes | None) -> list[np.ndarray] | None:
-    """Return the arrays of `_packed`, or None if the bytes are not there or not what was written."""
-    if (content := opened(stored)) is None:
-        return None
-    with np.load(io.BytesIO(content), allow_pickle=False) as found:
-        return [found[name] for name in found.files]

@@ -1,6 +1,5 @@
 """The manifest of a capture, capture.json with schema relit.capture/1, which is checked before any pixel is read."""
 
-import json
 import posixpath
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from stage.colour.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.model import FirstFault, Positive, Strict, Text, Vector
 from stage.patterns.codes import Pattern
-from stage.records import faults_of_each, read_record
+from stage.records import faults_of_each, read_record, record_text
 
 SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
@@ -143,7 +142,7 @@ class Manifest(Strict):
 
 def read_manifest(path: str | Path) -> Manifest:
     """Read and check a capture.json."""
-    return read_record(path, Manifest, SCHEMA, _frame_faults)
+    return read_record(path, Manifest, _frame_faults)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
@@ -153,11 +152,7 @@ def write_manifest(manifest: Manifest, path: str | Path) -> None:
 
 def manifest_text(manifest: Manifest) -> str:
     """Return the content of a capture.json, with `color_space` always and other keys when they differ from their default."""
-    data = manifest.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    frames = ",\n".join("    " + json.dumps(frame) for frame in data.pop("frames"))
-    first = {"schema": data.pop("schema"), "name": data.pop("name"), "color_space": manifest.color_space}
-    body = json.dumps({**first, **data}, indent=2)
-    return body[:-2] + f',\n  "frames": [\n{frames}\n  ]\n}}\n'
+    return record_text(manifest, "frames", color_space=manifest.color_space)
 
 
 def _frame_faults(data: dict[str, Any]) -> Iterator[str]:

@@ -14,7 +14,6 @@ from stage.files import write_text
 from stage.model import FirstFault, NotNegative, Positive, Strict, Text
 from stage.records import read_record
 
-SCHEMA = "relit.sequence/1"
 SEQUENCE_FILE = "sequence.json"
 FRAME_RATE = 24.0
 """Steps per second where nobody says how many."""
@@ -115,7 +114,7 @@ def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequ
         rate = frames_per_second or FRAME_RATE
         folders = capture_folders(path)
         return Sequence(tuple(TimeStep(folder.name, folder, number / rate) for number, folder in enumerate(folders)), rate, False)
-    found = read_record(file, SequenceFile, SCHEMA)
+    found = read_record(file, SequenceFile)
     if frames_per_second not in (None, found.frames_per_second):
         raise ManifestError(f"{file}: frames_per_second: is {found.frames_per_second:g}, --frame-rate {frames_per_second:g}: leave one out")
     rate = found.frames_per_second

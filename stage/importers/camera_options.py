@@ -147,9 +147,6 @@ WAYS: dict[str, tuple[int, int, int]] = {"right": (1, 0, 0), "left": (-1, 0, 0),
 
 Axes = tuple[str, str, str]
 """The directions of x, y and z of a table, each a member of WAYS."""
-CAMERA: Axes = ("right", "up", "towards")
-"""The axes of the camera frame, which OpenGL has too."""
-OPENCV: Axes = ("right", "down", "away")
 
 
 def camera_from_table(axes: Axes) -> np.ndarray:

@@ -7,7 +7,6 @@ scale is unknown.
 
 from pathlib import Path
 
-from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError
 from stage.importers.layout import image_resolution, read_lines, read_table, write_capture
 
@@ -27,7 +26,6 @@ def import_folder(source: Path, destination: Path) -> Path:
         raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
     mask = "mask.png" if (source / "mask.png").exists() else None
     return write_capture({
-        "schema": SCHEMA,
         "name": source.resolve().name,
         "color_space": "lin_rec709_scene",
         "camera": {"projection": "orthographic", "resolution": image_resolution(source / names[0])},

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from stage import inputs
-from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import View
 from stage.importers.layout import Imported, natural_order, write_capture
@@ -54,7 +53,7 @@ def import_folder(source: Path, destination: Path, *, packet: Path | None = None
             frames.append({"image": name, "tof": {"type": "cw", "modulation_hz": frequency,
                                                   "reference_phase_rad": -2 * pi * step / PHASES}})
     view = view or View()
-    written = write_capture({"schema": SCHEMA, "name": source.resolve().name, "camera": view.entry((WIDTH, HEIGHT)),
+    written = write_capture({"name": source.resolve().name, "camera": view.entry((WIDTH, HEIGHT)),
                              "saturation": float(SATURATED), "frames": frames}, packet, destination, folder=source, arrays=made)
     saturated = int((np.abs(readings[:USED]) >= SATURATED).any(axis=0).sum())
     return Imported(written, (

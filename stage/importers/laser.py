@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.formats.images import SUFFIXES as IMAGE_SUFFIXES
@@ -209,7 +208,7 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
     frames = [{"image": name, "laser": laser} for name, laser in zip(names, lasers, strict=True)]
     frames += [] if off is None else [{"image": off, "light": {"type": "off"}}]
     written = write_capture({
-        "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
+        "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
         "assumed": assumed_encoding(space, color_space), "frames": frames}, planes or source, destination, folder=source)
     return Imported(written, (
         *facts, ("without", f"{off} shows the scene without the laser" if off else

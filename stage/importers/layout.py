@@ -15,7 +15,7 @@ import OpenImageIO as oiio
 from pydantic import ValidationError
 
 from stage import inputs
-from stage.capture.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
+from stage.capture.manifest import FILE_NAME, SCHEMA, Manifest, manifest_text, write_manifest
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
@@ -146,13 +146,13 @@ def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
 
 def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folder: Path | None = None,
                   arrays: Mapping[str, np.ndarray] | None = None) -> Path:
-    """Check a manifest, place its images, and write it last, so that a capture.json never names files that do not exist.
+    """Check a manifest without its schema, place its images, and write it last, so that a capture.json never names files that do not exist.
 
     A capture.json that was there and differs is kept as PREVIOUS_NAME.
     `table`: the file that the manifest was made from; errors name it. `folder`: the folder of the images; None: that of `table`. `arrays`:
     what the .npy files of these names hold, which are written; the other files are placed."""
     try:
-        manifest = Manifest.model_validate(data)
+        manifest = Manifest.model_validate({"schema": SCHEMA, **data})
     except ValidationError as error:
         raise ManifestError(f"{table}: {describe(error)}") from error
     made = {name: _npy(array) for name, array in (arrays or {}).items()}

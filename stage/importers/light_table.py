@@ -48,9 +48,9 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
     suffix = path.suffix.lower()
     if suffix == ".mat":
         name, values = _variable(path, read_mat_arrays(path), variable)
-        return _numbers(path, values, run, f"{path}: {name}")
+        return _numbers(values, run, f"{path}: {name}")
     if suffix == ".npy":
-        return _numbers(path, read_array(path), run, str(path))
+        return _numbers(read_array(path), run, str(path))
     if suffix == ".json":
         return _from_json(path, variable, run)
     if suffix not in SUFFIXES:
@@ -91,7 +91,7 @@ def _variable(path: Path, arrays: Mapping[str, np.ndarray], wanted: str | None, 
     return next(iter(fitting.items()))
 
 
-def _numbers(path: Path, values: np.ndarray, run: Run | None, what: str) -> LightTable:
+def _numbers(values: np.ndarray, run: Run | None, what: str) -> LightTable:
     """Return the lights of an array of numbers without names."""
     if values.ndim != 2 or values.dtype.kind not in "fiu" or 3 not in values.shape:
         raise ManifestError(f"{what}: is {' x '.join(map(str, values.shape))}: give three numbers for each light")
@@ -223,7 +223,7 @@ def _from_json(path: Path, variable: str | None, run: Run | None) -> LightTable:
                                                                       for value in entry) for entry in data):
         if len({len(entry) for _, entry in entries}) > 1:
             raise ManifestError(f"{path}: its lights have different counts of numbers")
-        return _numbers(path, np.array([entry for _, entry in entries], dtype=np.float64), run, str(path))
+        return _numbers(np.array([entry for _, entry in entries], dtype=np.float64), run, str(path))
     lights = [_light(path, index, key, entry) for index, (key, entry) in enumerate(entries)]
     names = [name for name, _, _ in lights]
     strengths = [strength for _, _, strength in lights if strength is not None]

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from stage import inputs
-from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import View
@@ -41,7 +40,6 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     mask = "mask.png" if (folder / "mask.png").exists() else None
     space = color_space or color_space_of(first)
     return write_capture({
-        "schema": SCHEMA,
         "name": path.stem,
         "color_space": space,
         "assumed": assumed_encoding(space, color_space),

@@ -12,7 +12,7 @@ import numpy as np
 
 from stage.capture.light import PLACEHOLDER
 from stage.capture.lighting import MEASURED_BY
-from stage.capture.manifest import FILE_NAME, SCHEMA
+from stage.capture.manifest import FILE_NAME
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
@@ -116,7 +116,7 @@ def _written(source: Path, destination: Path, table: Path, names: Sequence[str],
     frames: list[dict[str, Any]] = [{"image": name, "light": light} for name, light in zip(names, lights, strict=True)]
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
-        "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
+        "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
         "irradiance_scale": scale, "assumed": assumed_encoding(space, color_space), "frames": frames,
     }, table, destination, folder=source)
     return Imported(written, (

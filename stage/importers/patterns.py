@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from stage.capture.camera import Distortion
-from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.importers.camera_options import MASK_WORDS, only_image
@@ -163,7 +162,7 @@ def import_opencv_gray(source: Path, destination: Path, *, projector: tuple[int,
                             "columns and rows with inverses, white, black")
     resolution = image_resolution(source / names[0])
     data: dict[str, Any] = {
-        "schema": SCHEMA, "name": source.resolve().name,
+        "name": source.resolve().name,
         "color_space": "lin_rec709_scene",
         "camera": {"projection": "orthographic", "resolution": resolution},
         "projector": {"resolution": projector},
@@ -264,7 +263,7 @@ def _write(source: Path, destination: Path, pictures: PatternImages, entries: li
         raise ManifestError(f"{source}: {beside[0]} was taken at one exposure, and --exposures-s says that every pattern was taken at "
                             f"{len(times)}: put white, black and the Gray code into the sequence")
     resolution = image_resolution(source / frames[0])
-    data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": pictures.color_space, "mask": mask,
+    data: dict[str, Any] = {"name": source.resolve().name, "color_space": pictures.color_space, "mask": mask,
                             "camera": {"projection": "orthographic", "resolution": list(resolution)},
                             "projector": {"resolution": list(pictures.projector)},
                             "assumed": [] if pictures.video is None else list(pictures.video.assumed)}

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from stage import inputs
-from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Selection, select
@@ -68,7 +67,7 @@ def import_folder(source: Path, destination: Path | None, *, color_space: ColorS
                {"type": "distant", "direction": vector.tolist(), "irradiance": power.tolist()}}
               for name, vector, power in zip(names, vectors, strength, strict=True)]
     space, mask = color_space or color_space_of(folder / names[0]), select(folder, Selection()).mask
-    written = write_capture({"schema": SCHEMA, "name": path.stem, "color_space": space, "camera": camera, "mask": mask,
+    written = write_capture({"name": path.stem, "color_space": space, "camera": camera, "mask": mask,
                              "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space),
                              "frames": frames}, path, destination or folder, folder=folder)
     crop = ("crop", f"{path} crops the images; the capture has them whole") if data.get("crop") else None

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.formats import images
@@ -42,7 +41,7 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
     name = right.stem if right.is_file() else right.resolve().name
     space = color_space or color_space_of(shown[0][0])
     data: dict[str, Any] = {
-        "schema": SCHEMA, "name": folder.name, "color_space": space, "assumed": assumed_encoding(space, color_space),
+        "name": folder.name, "color_space": space, "assumed": assumed_encoding(space, color_space),
         "camera": rig["camera"],
         "other_cameras": [{"name": name or "right", **rig["projector"], "camera_from_other": pose.tolist()}],
         "frames": [{"image": one, "stereo": {"images": [other]}} for one, other in zip(*names, strict=True)]}

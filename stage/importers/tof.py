@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError
 from stage.formats import images
 from stage.importers.camera_options import View
@@ -66,7 +65,7 @@ def import_correlations(
                                             **({} if source_m is None else {"source_m": list(source_m)})}}
               for plane, (frequency, phase) in zip(found, ways, strict=True)]
     made = {plane.name: plane.made.astype(np.float32) for plane in found if plane.made is not None}
-    written = write_capture({"schema": SCHEMA, "name": source.resolve().name, "camera": view.entry((cols, rows)), "frames": frames},
+    written = write_capture({"name": source.resolve().name, "camera": view.entry((cols, rows)), "frames": frames},
                             source / names[0], destination, folder=source, arrays=made)
     repeats = ", ".join(f"{frequency / 1e6:g} MHz repeats after {range_of_phase_m(2 * pi, frequency):.4g} m"
                         for frequency in frequencies_hz)
@@ -116,7 +115,7 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
     entry |= {name: value for name, value in (("pulses", pulses), ("count_scale", count_scale)) if value is not None}
     entry |= {"first_photon_only": True} if first_photon_only else {}
     entry |= {} if source_m is None else {"source_m": list(source_m)}
-    written = write_capture({"schema": SCHEMA, "name": (source if source.is_dir() else folder).resolve().name,
+    written = write_capture({"name": (source if source.is_dir() else folder).resolve().name,
                              "camera": view.entry((cols, rows)), "frames": [{"image": name, "tof": entry} for name in shapes]},
                             folder / names[0], destination, folder=folder, arrays=made)
     near, far = range_of_delay_m(start_s), range_of_delay_m(start_s + count * bin_s)

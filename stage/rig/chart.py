@@ -106,7 +106,7 @@ class ChartReadings(NamedTuple):
 
 def read_chart(path: Path) -> ChartReadings:
     """Read and check the file of a chart."""
-    return ChartReadings(path, read_record(path, Chart, CHART_SCHEMA))
+    return ChartReadings(path, read_record(path, Chart))
 
 
 def _readings(spectra: ChartSpectra, light: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from stage.model import FirstFault, Fraction, Positive, Strict, Text
 from stage.records import read_record
 from stage.rig.rig import CHANNELS, Rig
 
-CUES_SCHEMA, CUES_FILE = "relit.cues/1", "cues.json"
+CUES_FILE = "cues.json"
 
 
 class UniverseCue(Strict):
@@ -79,7 +79,7 @@ def read_cues(path: str | Path, rig: Rig) -> Cues:
     Raises ManifestError if the file is wrong, or was made for another rig; names the file and the field."""
     path = Path(path)
     path = path / CUES_FILE if path.is_dir() else path
-    cues = read_record(path, Cues, CUES_SCHEMA)
+    cues = read_record(path, Cues)
     if cues.rig_digest != rig_digest(rig):
         raise ManifestError(f"{path}: rig_digest: the cues were made for another rig, or for {cues.rig} before its lamps were changed: "
                             "run relit drive again")

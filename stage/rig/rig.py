@@ -4,11 +4,9 @@ Places and directions stand in one frame, the camera frame of the captures that 
 viewer.
 """
 
-import json
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,7 +15,7 @@ from stage.capture.camera import Camera
 from stage.colour.colour_spaces import LightSpaceName
 from stage.files import write_text
 from stage.model import Direction, FirstFault, Fraction, LitRgb, NotNegative, Positive, Strict, Text, Vector
-from stage.records import faults_of_each, read_record
+from stage.records import faults_of_each, read_record, record_text
 from stage.rig.controllers import Controllers
 
 RIG_SCHEMA = "relit.rig/1"
@@ -206,17 +204,9 @@ class Rig(Strict):
 
 def read_rig(path: str | Path) -> Rig:
     """Read and check a rig file."""
-    return read_record(path, Rig, RIG_SCHEMA, _lamp_faults)
+    return read_record(path, Rig, lambda data: faults_of_each(data, "lights", Lamp))
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
     """Write a rig file whole or not at all, a line for each lamp; keys that have their default are left out."""
-    data = rig.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    lamps = ",\n".join("    " + json.dumps(lamp) for lamp in data.pop("lights"))
-    head = {"schema": data.pop("schema"), "name": data.pop("name"), "color_space": rig.color_space, **data}
-    write_text(path, json.dumps(head, indent=2)[:-2] + f',\n  "lights": [\n{lamps}\n  ]\n}}\n')
-
-
-def _lamp_faults(data: dict[str, Any]) -> Iterator[str]:
-    """Yield the faults of every lamp of a rig file whose content is wrong, as sentences without the file."""
-    yield from faults_of_each(data, "lights", Lamp)
+    write_text(path, record_text(rig, "lights", color_space=rig.color_space))

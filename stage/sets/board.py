@@ -8,10 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from stage.model import Count, Finite, FirstFault, Fraction, NotNegative, Positive, Strict, Text
 
-SCAN_FILE, SCAN_SCHEMA = "board.json", "relit.board-scan/1"
-DESIGN_SCHEMA = "relit.board-design/1"
-REGIONS_SCHEMA = "relit.board-regions/1"
-STUDY_SCHEMA = "relit.gauge-study/1"
+SCAN_FILE = "board.json"
 Place = tuple[Finite, Finite]
 """x and y in metres, board frame."""
 

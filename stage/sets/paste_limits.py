@@ -10,7 +10,6 @@ from stage.errors import ManifestError
 from stage.model import Finite, FirstFault, Positive, Strict, Text
 from stage.records import read_record
 
-LIMITS_SCHEMA = "relit.paste-limits/1"
 Range = tuple[Finite, Finite]
 """The smallest and the largest value, per cent."""
 RANGES = ("volume_percent", "height_percent", "area_percent")
@@ -65,7 +64,7 @@ class PasteLimits(Strict):
 
 def read_limits(path: Path, name: str | None) -> tuple[PadLimits, ...]:
     """Read the limits of a class; `name` may be None where the file has a single one. Raises ManifestError; names file and field."""
-    classes = read_record(path, PasteLimits, LIMITS_SCHEMA).classes
+    classes = read_record(path, PasteLimits).classes
     known = ", ".join(each.name for each in classes)
     if name is None and len(classes) > 1:
         raise ManifestError(f"{path}: has the classes {known}: name one of them with --limit-class")

@@ -1,6 +1,5 @@
 """The file of a scan set, scan-set.json with schema relit.scan-set/1: range images and point sets of one object, with or without poses."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -10,10 +9,10 @@ from pydantic import AfterValidator, Field, model_validator
 
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
-from stage.records import faults_of_each, read_record
+from stage.records import faults_of_each, read_record, record_text
 from stage.transforms import ROTATION_ROUNDING, Row, off_rotation, rigid_fault, rotation_about
 
-SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
+SCAN_SET_FILE = "scan-set.json"
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
 """The length of each unit that a point set may have, in metres."""
 SYMMETRIC = 1e-6
@@ -159,15 +158,12 @@ class ScanSet(Strict):
 def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
     """Read and check a scan-set.json; `path`: the file, or the folder with it."""
     file = path / SCAN_SET_FILE if path.is_dir() else path
-    return file, read_record(file, ScanSet, SCAN_SET_SCHEMA, _faults)
+    return file, read_record(file, ScanSet, _faults)
 
 
 def write_scan_set(scans: ScanSet, path: Path) -> None:
     """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default."""
-    data = scans.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    entries = ",\n".join("    " + json.dumps(entry) for entry in data.pop("scans"))
-    body = json.dumps({"schema": data.pop("schema"), "name": data.pop("name"), **data}, indent=2)
-    write_text(path, body[:-2] + f',\n  "scans": [\n{entries}\n  ]\n}}\n')
+    write_text(path, record_text(scans, "scans"))
 
 
 def rotation_warnings(scans: ScanSet) -> list[str]:

@@ -8,8 +8,6 @@ from pydantic import Field, model_validator
 from stage.model import Direction, Finite, FirstFault, Strict, Text, Vector
 from stage.records import faults_of_each, read_record
 
-TOLERANCES_SCHEMA = "relit.tolerances/1"
-
 
 class ToleranceRegion(Strict):
     """A part of the surface of a design: what lies in a box, and what faces a direction, or both."""
@@ -61,4 +59,4 @@ class Tolerances(Strict):
 
 def read_tolerances(path: Path) -> Tolerances:
     """Read a file of regions. Raises ManifestError if it is wrong; names file and field. Raises StorageError if it cannot be read."""
-    return read_record(path, Tolerances, TOLERANCES_SCHEMA, lambda data: faults_of_each(data, "regions", ToleranceRegion))
+    return read_record(path, Tolerances, lambda data: faults_of_each(data, "regions", ToleranceRegion))

@@ -14,7 +14,6 @@ from stage.model import NotNegative, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.light_time import SPEED_OF_LIGHT
 
-SCHEMA = "relit.tof/1"
 HARMONICS = 12
 """The highest harmonic of the wiggling that is fitted: four phases alias the third and fifth harmonic of the light to the fourth, the
 seventh and ninth to the eighth, and their products to the twelfth; a third harmonic of 8 % leaves 1.5 mrad beyond."""
@@ -107,12 +106,12 @@ class TofCalibration(Strict):
 
 def read_calibration(path: str | Path) -> TofCalibration:
     """Read a relit.tof/1 file."""
-    return read_record(path, TofCalibration, SCHEMA)
+    return read_record(path, TofCalibration)
 
 
 def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
     """Write a relit.tof/1 file whole or not at all."""
-    data = {"schema": SCHEMA, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
+    data = {"schema": calibration.schema_, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
     write_text(path, json.dumps(data, indent=2) + "\n")
 
 
@@ -160,8 +159,6 @@ def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Tem
     return Temperature(reference_c=reference, metres_per_c=float(slope)), float(level)
 
 
-SWEEP_SCHEMA = "relit.tof-sweep/1"
-
 
 class SweepDistance(Strict):
     """The capture of the target at one distance."""
@@ -198,4 +195,4 @@ class Sweep(Strict):
 
 def read_sweep(path: str | Path) -> Sweep:
     """Read a relit.tof-sweep/1 file."""
-    return read_record(path, Sweep, SWEEP_SCHEMA)
+    return read_record(path, Sweep)

@@ -14,7 +14,6 @@ from stage.tof.raw_frames import read_array
 from stage.transforms import Transform
 
 FILE_NAME = "scan.json"
-SCHEMA = "relit.scan/1"
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 COLUMNS = "time_s, azimuth_rad, elevation_rad"
 
@@ -112,7 +111,7 @@ def read_scan(path: str | Path) -> Shots:
     with storage("read", folder):
         if not (folder / FILE_NAME).is_file():
             raise ManifestError(f"{folder}: holds no {FILE_NAME}")
-    scan = read_record(folder / FILE_NAME, Scan, SCHEMA)
+    scan = read_record(folder / FILE_NAME, Scan)
     for name in (scan.shots, *(() if scan.waveforms is None else (scan.waveforms.file,))):
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise ManifestError(f"{folder / FILE_NAME}: {name} leads out of the scan's folder")

@@ -7,10 +7,9 @@ import pytest
 import warp as wp
 
 from kernels import device as devices
-from kernels import images, staging
-from kernels.images import ImagesOnDevice
+from kernels import images
+from kernels.images import ImagesOnDevice, Staging
 from kernels.packs import as_pixels
-from kernels.staging import Staging
 
 CHANNELS, LIGHTS, PIXELS, BLOCK = 3, 16, 15 * 64, 2 * 64
 RNG = np.random.default_rng(39)
@@ -79,7 +78,7 @@ def test_several_threads_have_what_they_asked_for(device, held):
 def test_rows_go_through_both_buffers_in_turn(device, monkeypatch):
     if device == "cpu":
         pytest.skip("nothing is uploaded to the CPU")
-    monkeypatch.setattr(staging, "STAGED_BYTES", 3 * 64 * 4)
+    monkeypatch.setattr(images, "STAGED_BYTES", 3 * 64 * 4)
     rows = RNG.normal(size=(20, 100)).astype(np.float32)[:, 20:84]
     target = wp.empty(rows.shape, dtype=wp.float32, device=device)
     stream = wp.get_stream(device)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ class Server:
     def key(self, project: str = "larch", scope: Scope = Scope.ADMIN) -> str:
         """Make a key."""
         with self.database() as database:
-            return keys.create(database, NewKey(project=project, name="test", scope=scope))
+            return database.transact(partial(keys.insert, wanted=NewKey(project=project, name="test", scope=scope)))
 
     def client(self, key: str | None = None) -> httpx2.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}

@@ -37,8 +37,6 @@ operations for a whole pack."""
 
 _OK = int(Status.OK)
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Smoothed(NamedTuple):
     """Smoothed image, [rows · cols] on the device; pixels that were not OK keep what they had."""

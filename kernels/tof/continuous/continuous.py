@@ -230,8 +230,6 @@ ENTRIES = 512
 """Number of entries in the table: between two of them, the eighth harmonic of a correction departs from a straight line by less than 0.2 %
 of its amplitude."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 def sample_harmonics(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
     """Return Σ_h cosines[h]·cos hφ + sines[h]·sin hφ, radians, at the ENTRIES phases k · 2π / ENTRIES; h counts from 0."""

@@ -25,8 +25,6 @@ WINDOW_Z = 2.0
 
 _OK, _MULTIPATH = int(Status.OK), int(Status.MULTIPATH)
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Disagreement(NamedTuple):
     """Phases with the standard deviations that their disagreement shows."""

@@ -33,8 +33,6 @@ third of them suffices."""
 
 _OK, _FLYING = int(Status.OK), int(Status.FLYING)
 
-wp.set_module_options({"enable_backward": False})
-
 
 def mark_flying(ranges: wp.array, sigma: wp.array, status: wp.array, rows: int, cols: int, *, least_m: float = 0.02) -> wp.array:
     """Find flying pixels.

@@ -24,8 +24,6 @@ for one pixel."""
 LEAST_PART = 1 / 3
 """Least part of a window that must be dark: fewer pixels are the rim of something bright."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Pooled(NamedTuple):
     """Phases in which dark pixels are decoded with their neighbours."""

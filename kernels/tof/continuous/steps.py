@@ -27,8 +27,6 @@ SIGMAS = 4.0
 
 _OK = int(Status.OK)
 
-wp.set_module_options({"enable_backward": False})
-
 
 def cover_steps(ranges: Ranges, amplitude: wp.array, rows: int, cols: int, *, spacing_m: float) -> wp.array:
     """Return the standard deviation of each range, with that of mixed pixels where the range steps along a row or a column.

@@ -192,8 +192,6 @@ CERTAIN = 1 - 1e-5
 UNSEEN_SURFACE = 0.02
 """Prior weight of a surface that none of the pixel's neighbours is on: it limits how far they can outvote the pixel's own measurement."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
     """Let neighbours decide between the hypotheses of each pixel; ranges stay what they are, probabilities move.

@@ -17,8 +17,6 @@ import warp as wp
 from kernels.tof.histogram.pileup import LiveCounts
 from kernels.tof.histogram.pulse import Pulse
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.struct
 class Recorded:

@@ -28,8 +28,6 @@ CHANCE_SIGMAS = 3.5
 """Standard deviations of the sum of squared residuals up to which it is left to chance: about one pixel in a thousand, since the
 distribution is skewed."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 def misfit(histograms: LiveCounts, pulse: Pulse, found: Returns) -> np.ndarray:
     """Return the dispersion of each return's residuals, [return, pixel] float32; 1 where chance explains them.

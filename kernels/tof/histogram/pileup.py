@@ -8,8 +8,6 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 
-wp.set_module_options({"enable_backward": False})
-
 LEFT_OVER = 0.5
 """Number of pulses that count as left after a bin that took them all: the logarithm of zero is not finite, and dropping the bin would move
 the return."""

@@ -53,8 +53,6 @@ pulse."""
 
 _OK, _LOW, _SATURATED = int(Status.OK), int(Status.LOW_MODULATION), int(Status.SATURATED)
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Returns(NamedTuple):
     """Returns of each pixel, the most certain first; on the device. What was not found is 0."""

@@ -33,8 +33,6 @@ ROUNDS = 2
 SLOPE_WIDTHS = 0.25
 """Standard deviation of the time's change from a pixel to the next on one surface, in pulse widths (and bins, where these are wider)."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Voted(NamedTuple):
     """The most probable return of each pixel, on the host."""

@@ -49,8 +49,6 @@ LEAST_DETERMINANT = 1e-9
 """Least determinant of the information matrix of two returns, in units of their photons: below it, float32 cannot tell the returns
 apart."""
 
-wp.set_module_options({"enable_backward": False})
-
 
 class Times(NamedTuple):
     """Time of each return, on the device; 0 where there is none."""

@@ -9,13 +9,12 @@ from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint32, c_uint64, c_void_p
 from ctypes.util import find_library
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from service.acquisition.cameras.camera import NoPictureError, Picture, Setup
+from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
 from stage.files import replacing
 from stage.formats import images
@@ -45,12 +44,11 @@ class AravisError(Exception):
     """Aravis, or the camera, has refused something; the text is its own."""
 
 
-class AravisCamera:
+class AravisCamera(Camera):
     """One camera, by the name that Aravis gives it."""
 
     def __init__(self, detail: str, setup: Setup) -> None:
         self._name, self._setup, self._count = f"--camera aravis{':' * bool(detail)}{detail}", setup, 0
-        self.exposures_s: tuple[float, ...] = ()
         library = _library()
         if library is None:
             raise RequestError(f"{self._name}: needs the library Aravis, which is not installed: apt install libaravis-0.8-0")
@@ -87,10 +85,6 @@ class AravisCamera:
         except AravisError:
             return None
 
-    def present(self) -> list[str]:
-        """Return nothing: pictures come over the network or the cable."""
-        return []
-
     def take(self, exposure_s: float | None) -> Picture:
         """Take a picture, and write it with 16 bits, in which readings stay proportional to light."""
         pixels = self._frame(exposure_s)
@@ -106,10 +100,6 @@ class AravisCamera:
             return (self._frame(None).astype(np.float32) / FULL) ** np.float32(1 / 2.2)
         except NoPictureError as error:
             raise RequestError(f"{self._name}: {error}") from error
-
-    def unasked(self) -> list[Path]:
-        """Return nothing: pictures come on request."""
-        return []
 
     def close(self) -> None:
         """Let go of the camera."""

@@ -1,9 +1,10 @@
 """The interface that every camera has, and how one is named on the command line."""
 
 import shlex
+from abc import ABC, abstractmethod
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -53,37 +54,44 @@ class Setup(NamedTuple):
         return cls(request.out / SPOOL, request.timeout, tuple(shlex.split(request.trigger or "")), known, request.jpeg)
 
 
-class Camera(Protocol):
+class Camera(ABC):
     """A camera that takes one picture after another; all its settings stay as they are but the exposure time."""
 
     @property
     def settings(self) -> dict[str, str]:
         """Return the settings that decide what a picture looks like, by name; those that cannot be read are left out."""
+        return {}
 
     @property
     def exposure_s(self) -> float | None:
         """Return the exposure time; None where the camera does not tell it or cannot be set to another."""
+        return None
 
     @property
     def exposures_s(self) -> tuple[float, ...]:
         """Return the exposure times to which the camera can be set; none where it has any, or does not tell them."""
+        return ()
 
     def present(self) -> list[str]:
         """Return the names of the files that are known: those that were there when the camera was opened, or were told then."""
+        return []
 
+    @abstractmethod
     def take(self, exposure_s: float | None) -> Picture:
         """Take a picture and wait for it.
         `exposure_s`: the exposure time; None: the one that the camera has. Raises NoPictureError if no picture came in time. Raises
         RequestError if the camera does not answer, or cannot be set to the exposure."""
 
+    @abstractmethod
     def look(self) -> np.ndarray:
         """Return what the camera sees now, [rows, cols, 3] float32, 0 to 1, encoded for a screen.
         Raises RequestError if it has no live view, or does not answer."""
 
     def unasked(self) -> list[Path]:
         """Return the pictures that came without being asked for since the last one, as late ones do; they are not told again."""
+        return []
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - a folder has nothing to let go of
         """Let go of the camera."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import gphoto2 as gp
 import numpy as np
 
-from service.acquisition.cameras.camera import NoPictureError, Picture, Setup
+from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
 from stage.files import replacing
 from stage.formats import images
@@ -42,7 +42,7 @@ REASONS = {
 }
 
 
-class Gphoto2Camera:
+class Gphoto2Camera(Camera):
     """One camera at a USB port."""
 
     def __init__(self, detail: str, setup: Setup) -> None:
@@ -83,10 +83,6 @@ class Gphoto2Camera:
     def exposures_s(self) -> tuple[float, ...]:
         """Return the exposure times that the camera offers."""
         return tuple(self._times().values())
-
-    def present(self) -> list[str]:
-        """Return nothing: files come over the cable."""
-        return []
 
     def take(self, exposure_s: float | None) -> Picture:
         """Release the camera, and fetch the picture."""

@@ -1,11 +1,10 @@
 """A video device (UVC, V4L2), or a video file in its place, through OpenCV."""
 
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from service.acquisition.cameras.camera import NoPictureError, Picture, Setup
+from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
 from stage.files import replacing
 from stage.formats import images
@@ -22,13 +21,12 @@ RECORDED = {"width": cv2.CAP_PROP_FRAME_WIDTH, "height": cv2.CAP_PROP_FRAME_HEIG
             "gain": cv2.CAP_PROP_GAIN, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE, "focus": cv2.CAP_PROP_FOCUS}
 
 
-class VideoDevice:
+class VideoDevice(Camera):
     """Takes the frame of a video that comes next after a release."""
 
     def __init__(self, detail: str, setup: Setup) -> None:
         self._name, self._setup, self._count = f"--camera video:{detail}", setup, 0
         self._live = detail.isdigit()
-        self.exposures_s: tuple[float, ...] = ()
         self._video = cv2.VideoCapture(int(detail) if self._live else detail)
         if not self._video.isOpened():
             raise RequestError(f"{self._name}: cannot be opened: check that it is connected and that no other program uses it")
@@ -40,14 +38,6 @@ class VideoDevice:
         """Return the settings that the device tells."""
         found = {name: self._video.get(number) for name, number in RECORDED.items()}
         return {name: f"{value:g}" for name, value in found.items() if value not in (-1.0, 0.0)}
-
-    @property
-    def exposure_s(self) -> None:
-        """Return nothing: exposure times of devices have no unit."""
-
-    def present(self) -> list[str]:
-        """Return nothing: pictures are taken from the video."""
-        return []
 
     def take(self, exposure_s: float | None) -> Picture:
         """Take the next frame."""
@@ -73,10 +63,6 @@ class VideoDevice:
         if not there or frame is None:
             raise RequestError(f"{self._name}: gives no frames any more: check that it is connected")
         return np.ascontiguousarray(frame[..., ::-1], np.float32) / 255
-
-    def unasked(self) -> list[Path]:
-        """Return nothing: frames come on request."""
-        return []
 
     def close(self) -> None:
         """Let go of the device."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.acquisition.cameras.camera import NoPictureError, Picture, Setup
+from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
 from stage.errors import ImageError, storage
 from stage.formats import images
@@ -16,7 +16,7 @@ POLL_S = 0.01
 """The time between two looks at the folder."""
 
 
-class WatchedFolder:
+class WatchedFolder(Camera):
     """Takes new files of a folder for pictures, in the order in which they come."""
 
     def __init__(self, folder: Path, pattern: str, setup: Setup) -> None:
@@ -24,9 +24,6 @@ class WatchedFolder:
             raise RequestError(f"--camera watch:{folder}: there is no such folder: give the one into which the tethering program writes")
         self._folder, self._pattern, self._setup = folder, pattern, setup
         self._known = {path.name for path in self._files()} if setup.known is None else set(setup.known)
-        self.settings: dict[str, str] = {}
-        self.exposure_s: None = None
-        self.exposures_s: tuple[float, ...] = ()
 
     def present(self) -> list[str]:
         """Return the names of the files that are known."""
@@ -60,9 +57,6 @@ class WatchedFolder:
         found = self._new()
         self._known.update(path.name for path in found)
         return found
-
-    def close(self) -> None:
-        """Do nothing."""
 
     def _release(self, exposure_s: float | None) -> None:
         if not self._setup.trigger:

@@ -13,8 +13,6 @@ from stage.capture.light import Polarization
 from stage.model import Count, FirstFault, Fraction, NotNegative, Positive, Strict, Text
 from stage.records import read_record
 
-PLAN_SCHEMA = "relit.plan/1"
-
 
 class Sequence(Strict):
     """The fields of every sequence of pictures."""
@@ -142,7 +140,7 @@ def read_plan(given: str) -> Plan:
     """Return the plan of a file, or of names with commas between them, such as dark,olat.
     Raises RequestError if it names neither a file nor a known sequence. Raises ManifestError if the file is wrong; names file and field."""
     if Path(given).suffix == ".json" or Path(given).is_file():
-        return read_record(given, Plan, PLAN_SCHEMA)
+        return read_record(given, Plan)
     names = given.split(",")
     unknown = [name for name in names if name not in NAMED]
     if unknown:

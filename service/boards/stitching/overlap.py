@@ -179,7 +179,7 @@ def _refine(first: HeightPatch, second: HeightPatch, shift: tuple[int, int], gri
         if common is None:
             return None
         fit = _fit(first, second, common, shift, grid, centre, length_m)
-        moved = _pixels(fit.difference, shift, grid)
+        moved = _pixels(fit.difference, grid)
         if max(abs(moved[0] - shift[0]), abs(moved[1] - shift[1])) <= 0.6:
             return fit
         difference = fit.difference
@@ -187,7 +187,7 @@ def _refine(first: HeightPatch, second: HeightPatch, shift: tuple[int, int], gri
     return fit._replace(difference=difference)
 
 
-def _pixels(difference: np.ndarray, shift: tuple[int, int], grid: BoardGrid) -> tuple[float, float]:
+def _pixels(difference: np.ndarray, grid: BoardGrid) -> tuple[float, float]:
     """Return the shift of the second patch in rows and columns that a difference of motions, first − second, stands for."""
     return float(difference[1] / grid.pixel_m), float(-difference[0] / grid.pixel_m)
 

@@ -13,7 +13,7 @@ Source: as service/light_estimation/grey_ball.py; for the mirror ball Debevec, "
     1998; isotonic regression by pool adjacent violators, Ayer et al., Annals of Mathematical Statistics 26(4), 1955.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import isotonic_regression, least_squares
@@ -54,16 +54,6 @@ class Reading(NamedTuple):
     sigma: np.ndarray  # [3] float64: standard error from the scatter of the pixels
 
 
-class Template(Protocol):
-    """The pixels in which a lamp is read."""
-
-    misfit: float
-    """What the brightest image leaves of the model, relative to it."""
-
-    def read(self, radiance: np.ndarray, saturated: np.ndarray | None) -> Reading:
-        """Return the reading of an image, [h, w, 3] of the target's box. Raises CalibrationError if it is saturated."""
-
-
 class LambertTemplate(NamedTuple):
     """A grey ball or card under a lamp."""
 
@@ -71,6 +61,7 @@ class LambertTemplate(NamedTuple):
     model: np.ndarray  # [pixels, 1 or 3] float64: n·l, of a chart times the reflectance
     weight: np.ndarray  # [pixels, 1] float64, one for all channels: gloss is as bright beside the noise of a faint channel
     misfit: float
+    """What the brightest image leaves of the model, relative to it."""
 
     def read(self, radiance: np.ndarray, saturated: np.ndarray | None) -> Reading:
         """Return the least-squares factor of the model in each channel."""

@@ -9,8 +9,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.printing import print_table, print_warnings
-from service.cli.progress import with_bar
-from service.cli.request_commands import local_command, product_command
+from service.cli.request_commands import product_command
 from service.requests.calibrate import (
     DarkRequest,
     FlatFieldRequest,
@@ -50,11 +49,11 @@ def register(app: typer.Typer) -> None:
     product_command(kinds, "dark", DarkRequest, "service.calibrate.sensor:dark", partial(_print_image, "dark"))
     product_command(kinds, "flat-field", FlatFieldRequest, "service.calibrate.sensor:flat_field", partial(_print_image, "flat"))
     product_command(kinds, "saturation", SaturationRequest, "service.calibrate.sensor:saturation", _saturation)
-    product_command(kinds, "white-balance", WhiteBalanceRequest, "service.calibrate.white_balance:white_balance", _white_balance)
+    product_command(kinds, "white-balance", WhiteBalanceRequest, "service.calibrate.sensor:white_balance", _white_balance)
     product_command(kinds, "chart", ChartRequest, "service.calibrate.chart:calibrate_chart", _chart)
     product_command(kinds, "procam", ProcamRequest, "service.calibrate.procam:procam", _procam)
     product_command(kinds, "stereo", StereoRequest, "service.calibrate.stereo:stereo", _stereo)
-    local_command(kinds, "laser-planes", _laser_planes)
+    product_command(kinds, "laser-planes", LaserPlanesRequest, "service.calibrate.laser_planes:laser_planes", _laser_planes)
     product_command(kinds, "response", ResponseRequest, "service.calibrate.response:response", _response)
     product_command(kinds, "tof", TofCalibrationRequest, "service.calibrate.tof:calibrate_tof", _tof)
     product_command(kinds, "rig", RigCalibrationRequest, "service.calibrate.rig_lamps:calibrate_rig", _rig)
@@ -98,10 +97,7 @@ def _stereo(result: Any) -> None:
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
 
 
-def _laser_planes(request: LaserPlanesRequest) -> None:
-    from service.calibrate.laser_planes import laser_planes
-
-    result = with_bar(laser_planes, request)
+def _laser_planes(result: Any, request: LaserPlanesRequest) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
 

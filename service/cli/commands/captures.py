@@ -1,24 +1,29 @@
-"""relit info and relit view: look at a capture, here and in a browser."""
+"""relit info, view, solve, relight and shade: look at a capture, here and in a browser, solve it, and light it and its maps."""
+
+from typing import Any
 
 import typer
 
-from service.cli.printing import print_warnings
-from service.cli.progress import with_bar
-from service.cli.request_commands import local_command
+from service.cli.printing import check_single, counted, print_sequence, print_warnings
+from service.cli.progress import ProgressOption, ProgressStyle, progress_in, with_bar
+from service.cli.request_commands import local_command, product_command
 from service.requests.captures import InfoRequest, ViewRequest
+from service.requests.relight import RelightRequest
+from service.requests.shade import ShadeRequest
+from service.requests.solve import SolveRequest
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    local_command(app, "info", _info)
-    local_command(app, "view", _view)
+    product_command(app, "info", InfoRequest, "service.captures.info:inspect", _info)
+    product_command(app, "view", ViewRequest, "service.viewing.view_files:view", _view)
+    for command in (_solve, _relight, _shade):
+        local_command(app, command.__name__[1:], command)
 
 
-def _info(request: InfoRequest) -> None:
-    from service.captures.info import inspect
+def _info(found: Any) -> None:
     from stage.errors import StageError
 
-    found = with_bar(inspect, request)
     for name, value in found.facts:
         print(f"{name:<12} {value}")
     for finding in found.findings:
@@ -30,10 +35,7 @@ def _info(request: InfoRequest) -> None:
         raise StageError(f"{found.faults[0]}{others}")
 
 
-def _view(request: ViewRequest) -> None:
-    from service.viewing.view_files import view
-
-    result = with_bar(view, request)
+def _view(result: Any) -> None:
     print(f"view     {result.path}")
     print(f"frames   {result.frames}")
     if result.layers:
@@ -43,3 +45,71 @@ def _view(request: ViewRequest) -> None:
         print(f"relight  {result.terms} coefficient images: {mean:.2g} of 255 levels off under lights that they were not made from, "
               f"{largest:.2g} under the worst")
     print_warnings(result.findings)
+
+
+def _solve(request: SolveRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
+    from stage.capture.sequence import is_sequence
+
+    if is_sequence(request.capture):
+        from service.sequences.run import solve_sequence
+
+        print_sequence(with_bar(solve_sequence, request, progress))
+        return
+    from service.solve.solve import solve
+
+    check_single(request)
+    result = with_bar(solve, request, progress)
+    print(f"maps     {result.maps_path}")
+    print(f"report   {result.report_path}")
+    print(f"pixels   {counted(result.counts)}")
+    print_warnings(result.warnings)
+    if result.suspects:
+        worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
+        more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""
+        print(f"suspect  lights that disagree with the others: {worst}{more}; check their direction and irradiance")
+    if not result.counts.get("ok"):
+        raise typer.Exit(1)
+
+
+def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
+    from service.relight.relight import relight
+
+    with progress_in(progress) as bar:
+        result = relight(request, bar)
+    last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
+    print(f"frames   {result.frames[0]}{last}")
+    if result.captures > 1:
+        print(f"captures {result.captures}, one a frame")
+    if result.skipped:
+        rest = "; the others are made" if result.skipped < len(result.frames) else ""
+        print(f"skipped  {result.skipped} of {len(result.frames)} frames were there already, made by an equal run{rest}")
+    if request.display is not None:
+        print(f"display  {request.display}")
+    if request.sheet is not None:
+        print(f"sheet    {request.sheet}")
+    if request.nuke is not None:
+        print(f"nuke     {request.nuke}")
+    if request.report is not None:
+        print(f"report   {request.report}")
+    if result.near_lights:
+        print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
+    if result.matte:
+        print(f"matte    {result.matte}")
+    if result.clipped:
+        print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+    print_warnings(result.warnings)
+
+
+def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
+    from service.relight.shade import shade
+
+    with progress_in(progress) as bar:
+        result = shade(request, bar)
+    print(f"picture  {result.path}")
+    if request.display is not None:
+        print(f"display  {request.display}")
+    if not result.metric:
+        print("scale    the maps have none: places of lights are taken in pixels")
+    if result.clipped:
+        print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+    print_warnings(result.warnings)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.progress import ProgressBar, with_bar
-from service.cli.request_commands import local_command
+from service.cli.request_commands import local_command, product_command
 from service.requests.demo import BenchRequest, DemoRequest, sample_folder
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ ServeOption = Annotated[bool, typer.Option("--serve", help="Afterwards run the s
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "demo", _demo)
-    local_command(app, "bench", _bench)
+    product_command(app, "bench", BenchRequest, "service.demo.bench:bench", lambda lines: print("\n".join(lines)))
 
 
 def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
@@ -67,9 +67,3 @@ def _results(result: "DemoResult", device: str | None) -> "SampleResults":
     return SampleResults([result.solved.maps_path, result.solved.report_path, result.asset, *result.frames],
                          *(sorted(folder.iterdir()) for folder in reversed(folders)))
 
-
-def _bench(request: BenchRequest) -> None:
-    from service.demo.bench import bench
-
-    lines = with_bar(bench, request)
-    print("\n".join(lines))

@@ -1,5 +1,6 @@
 """relit depth, separate, scan, simulate and patterns: from projected light, lasers and time of flight, and what to project."""
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -21,8 +22,8 @@ def register(app: typer.Typer) -> None:
     product_command(app, "separate", SeparateRequest, "service.depth.separate:separate", _separate)
     product_command(app, "scan", ScanRequest, "service.depth.scan:scan", _scan)
     kinds = make_group("simulate", help="The raw frames that a time-of-flight camera would make of a depth.")
-    local_command(kinds, "cw", _cw)
-    local_command(kinds, "pulsed", _pulsed)
+    local_command(kinds, "cw", _simulate_as(SimulateCwRequest))
+    local_command(kinds, "pulsed", _simulate_as(SimulatePulsedRequest))
     app.add_typer(kinds)
     local_command(app, "patterns", _patterns)
 
@@ -71,18 +72,13 @@ def _scan(result: Any) -> None:
     print_warnings(result.warnings)
 
 
-def _cw(request: SimulateCwRequest) -> None:
-    _simulate(request)
+def _simulate_as(model: type[SimulateCwRequest | SimulatePulsedRequest]) -> Callable[..., None]:
+    def run(request: model) -> None:  # type: ignore[valid-type]
+        from service.depth.tof.simulate import simulate_tof
 
+        print(f"capture  {simulate_tof(request)}")
 
-def _pulsed(request: SimulatePulsedRequest) -> None:
-    _simulate(request)
-
-
-def _simulate(request: SimulateCwRequest | SimulatePulsedRequest) -> None:
-    from service.depth.tof.simulate import simulate_tof
-
-    print(f"capture  {simulate_tof(request)}")
+    return run
 
 
 def _patterns(drawn: Given[PatternsRequest], planned: Given[PlanRequest], plan: PlanOption = False) -> None:

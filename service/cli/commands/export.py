@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
     local_command(app, "blender-extension", _blender_extension)
     local_command(app, "inspect", _inspect)
     product_command(app, "basis", BasisRequest, "service.basis.basis:make_basis", _basis)
-    local_command(app, "publish", _publish)
+    product_command(app, "publish", PublishRequest, "service.publish.publish:publish", _publish)
     product_command(app, "join", JoinRequest, "service.joining.join:join", _join)
 
 
@@ -99,10 +99,7 @@ def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _publish(request: PublishRequest) -> None:
-    from service.publish.publish import publish
-
-    result = with_bar(publish, request)
+def _publish(result: Any, request: PublishRequest) -> None:
     print(f"{request.kind:<8} {result.path}")
     print(f"files    {result.files}, {result.size / 1e6:.3g} MB")
     if result.left_out:

@@ -11,9 +11,8 @@ from service.cli.groups import make_group
 from service.cli.remote import KeyOption
 from service.cli.request_commands import local_command
 from service.requests.imports.base import ImportRequest
-from service.requests.imports.interleaved import InterleavedImport
 from service.requests.imports.layouts import LAYOUTS, request_of, taken_apart
-from service.requests.imports.patterns import StereoImport
+from service.requests.imports.patterns import InterleavedImport, StereoImport
 from service.requests.imports.scans import ScansImport
 
 if TYPE_CHECKING:

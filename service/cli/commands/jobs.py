@@ -12,7 +12,6 @@ from service.cli.remote import CancelOption, KeyOption, ResultsOption, ServerOpt
 from service.requests.base.identifiers import DEFAULT_SERVER
 
 if TYPE_CHECKING:
-    from service.client import Client
     from service.requests.answers import JobView
 
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Identifier of the job: job_….", show_default=False)]
@@ -24,8 +23,11 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = make_group(help="List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results.")
     group.command("list")(list_)
-    for command in (show, wait, cancel, retry, resume, results):
+    for command in (show, wait):
         group.command(command.__name__)(command)
+    for action, words in (("cancel", "Cancel a job"), ("retry", "Queue a failed job again"), ("resume", "Queue a cancelled job again")):
+        group.command(action, help=f"{words}; its finished steps are kept.")(_steer(action))
+    group.command("results")(results)
     app.add_typer(group, name="jobs")
 
 
@@ -49,19 +51,12 @@ def wait(job: JobArgument, out: ResultsOption = None, cancel_on_interrupt: Cance
         wait_for(client, job, out=out, cancel_on_interrupt=cancel_on_interrupt)
 
 
-def cancel(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Cancel a job; its finished steps are kept."""
-    _steer(lambda client: client.jobs.cancel(job), server, key)
+def _steer(action: str) -> Callable[..., None]:
+    def steer(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
+        with connected(server, key) as client:
+            _print(getattr(client.jobs, action)(job))
 
-
-def retry(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Queue a failed job again; its finished steps are kept."""
-    _steer(lambda client: client.jobs.retry(job), server, key)
-
-
-def resume(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Queue a cancelled job again; its finished steps are kept."""
-    _steer(lambda client: client.jobs.resume(job), server, key)
+    return steer
 
 
 def results(job: JobArgument, out: OutOption = None, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
@@ -72,11 +67,6 @@ def results(job: JobArgument, out: OutOption = None, server: ServerOption = DEFA
             return
         for file in client.jobs.results(job):
             print(f"{file.size:>12}  {file.name}")
-
-
-def _steer(action: "Callable[[Client], JobView]", server: str, key: str | None) -> None:
-    with connected(server, key) as client:
-        _print(action(client))
 
 
 def _print(job: "JobView") -> None:

@@ -74,7 +74,7 @@ def revoke(
     identifier = key.partition(".")[0]
 
     def work(connection: Any) -> str | None:
-        project = keys.withdraw(connection, identifier)
+        project = keys.revoke(connection, identifier)
         if project is not None:
             audit.record_operator(connection, project, "key.revoke", identifier)
         return project

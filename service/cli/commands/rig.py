@@ -1,12 +1,15 @@
-"""relit rig and relit drive: rig files, and the levels of their lamps that reproduce an environment."""
+"""relit rig, drive, play and twin: rig files, the levels of their lamps that reproduce an environment, and what sends and shows these."""
+
+from typing import Any
 
 import typer
 
 from service.cli.groups import make_group
 from service.cli.printing import print_warnings
-from service.cli.progress import with_bar
-from service.cli.request_commands import local_command
+from service.cli.progress import ProgressBar
+from service.cli.request_commands import local_command, product_command
 from service.requests.drive import DriveRequest
+from service.requests.play import PlayRequest, TwinRequest
 from service.requests.rig import (
     RigCheckRequest,
     RigFromCaptureRequest,
@@ -25,15 +28,14 @@ def register(app: typer.Typer) -> None:
     local_command(rig, "from-csv", _from_csv)
     local_command(rig, "from-mvr", _from_mvr)
     local_command(rig, "sweep", _sweep)
-    local_command(rig, "plan", _plan)
+    product_command(rig, "plan", RigPlanRequest, "service.rigs.dome_plan:plan_rig", _plan)
     app.add_typer(rig)
-    local_command(app, "drive", _drive)
+    product_command(app, "drive", DriveRequest, "service.drive.drive:drive", _drive)
+    local_command(app, "play", _play)
+    local_command(app, "twin", _twin)
 
 
-def _drive(request: DriveRequest) -> None:
-    from service.drive.drive import drive
-
-    result = with_bar(drive, request)
+def _drive(result: Any) -> None:
     print(f"cues     {result.cues}")
     print(f"picture  {result.picture}")
     print(f"report   {result.report}")
@@ -89,13 +91,43 @@ def _sweep(request: RigSweepRequest) -> None:
     print(f"table    {made.table}")
 
 
-def _plan(request: RigPlanRequest) -> None:
-    from service.rigs.dome_plan import plan_rig
-
-    rows = with_bar(plan_rig, request)
+def _plan(rows: Any, request: RigPlanRequest) -> None:
     print(f"table    {request.out / 'plan.csv'}")
     print(f"plot     {request.out / 'plan.png'}")
     for row in rows:
         highlights = ", ".join(f"{100 * error:.2g}" for error in row.highlights)
         of = f" of {row.rig}" if row.rig else ""
         print(f"{row.lights:>6} lamps{of} under {row.environment}: irradiance {100 * row.irradiance:.2g} %, highlights {highlights} %")
+
+
+def _play(request: PlayRequest) -> None:
+    from service.play.play import LATE_S, play
+
+    result = play(request)
+    print(f"frames   {result.frames} sent; the lamps are dark")
+    late = "none" if not result.late else f"{result.late} by more than {1e3 * LATE_S:g} ms, the latest by {1e3 * result.latest_s:.3g} ms"
+    print(f"late     {late}")
+    if result.interrupted and not request.loop and request.hold is None:
+        print("ended    before the last frame")
+        raise typer.Exit(1)
+
+
+def _twin(request: TwinRequest) -> None:
+    from service.twin.twin import open_twin, rehearse
+
+    with ProgressBar() as bar:
+        twin = open_twin(request, bar)
+    print_warnings(twin.picture.warnings)
+    result = rehearse(twin, request, lambda page: _listening(request.interface, page))
+    print(f"frames   {result.frames} received")
+    if result.out_of_order:
+        print(f"packets  {result.out_of_order} came out of order and were left out")
+    for name, path in (("picture", request.snapshot), ("levels", request.record)):
+        if path is not None:
+            print(f"{name:<8} {path}")
+
+
+def _listening(interface: str, page: str | None) -> None:
+    print(f"twin     listens on {interface} for sACN and Art-Net", flush=True)
+    if page is not None:
+        print(f"page     {page}: until Ctrl-C", flush=True)

@@ -26,7 +26,7 @@ from service.requests.base.identifiers import ALPHABET, CAPTURE, DEFAULT_SERVER,
 from service.requests.base.options import Option, help_text, is_document, options_of
 from service.requests.jobs import JOBS
 from service.requests.light.frame_range import frame_numbers
-from stage.records import read_record, schema_of
+from stage.records import read_record
 
 if TYPE_CHECKING:
     from service.client import Client
@@ -57,7 +57,7 @@ def _submit(given: Given[JobRequest], server: str, key: str | None, wait: bool, 
         frame_numbers(given.values["frames"], 1)
     for option in options_of(given.model):
         if is_document(option.kind) and option.name in given.values:
-            given.values[option.name] = read_record(given.values[option.name], option.kind, schema_of(option.kind))
+            given.values[option.name] = read_record(given.values[option.name], option.kind)
     request = given.build(**{name: _each(given.values[name], partial(_placeholder, prefix)) for name, prefix in inputs.items()})
     with connected(server, key) as client:
         if out is not None:

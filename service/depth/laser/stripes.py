@@ -169,7 +169,7 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
     """Measure the stripe of one frame on each line; depths outside the span are OUT_OF_RANGE.
     `sweep`: of the frames whose stripes cross the same lines."""
     along = along_of(laser)
-    place, sigma, brightness, amplitude, status = _peaks(signal, mask, along, sweep, device)
+    place, sigma, brightness, amplitude, status = _peaks(signal, along, sweep, device)
     chosen: Chosen = choose_curves(place, brightness, status)
     lines = np.arange(place.shape[1])
     centre, spread_px, peak = (values[chosen.peak, lines] for values in (place, sigma, amplitude))
@@ -190,7 +190,7 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
                    int(chosen.doubled.sum()), int(chosen.second.sum()))
 
 
-def _peaks(signal: Signal, mask: np.ndarray, along: str, sweep: Sweep, device: str) -> tuple[np.ndarray, ...]:
+def _peaks(signal: Signal, along: str, sweep: Sweep, device: str) -> tuple[np.ndarray, ...]:
     """Return centre, deviation, brightness, peak and status of the brightest stripes of each line, [PEAKS, lines] each.
 
     After a stripe is found, its pixels are taken out and the next is looked for.

@@ -201,7 +201,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         status = np.where(missing, int(Status.LOW_MODULATION), np.where(taken & (photons > 0), int(Status.OK), status))
         weak = int((taken & ~missing).sum())
     if pile_up is not None and pile_up.relative > 0:
-        sigma = np.hypot(sigma, _doubt(frames, photons_of, pile_up, pulse, position, device))
+        sigma = np.hypot(sigma, _doubt(photons_of, pile_up, pulse, position, device))
     if fog is not None:
         sigma = np.hypot(sigma, fog.shift(position, photons, pulse.width))
         outside = fog.stands_out(photons_of, found.background.numpy(), position, pulse.width)
@@ -302,7 +302,7 @@ def _live(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, 
     return histograms, shape_of(histograms, shown), found
 
 
-def _doubt(frames: Histograms, photons: np.ndarray, pile_up: PulseCount, pulse: Pulse, position: np.ndarray, device: str) -> np.ndarray:
+def _doubt(photons: np.ndarray, pile_up: PulseCount, pulse: Pulse, position: np.ndarray, device: str) -> np.ndarray:
     """Return by how many bins each position moves with the number of pulses, which was estimated, by a standard deviation."""
     more = max(math.ceil(pile_up.pulses * math.exp(pile_up.relative)), pile_up.pulses + 1)
     other = find_returns(correct_pileup(place(photons, device), pulses=more), pulse)

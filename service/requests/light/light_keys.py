@@ -12,7 +12,6 @@ from stage.colour.colour_spaces import LightSpaceName
 from stage.model import Direction, FirstFault, NotNegative, Rgb, Strict, Text
 from stage.records import read_record
 
-SCHEMA = "relit.keys/1"
 SUN_DEGREES = 0.53
 """Angular diameter of the sun, and the default of UsdLux DistantLight."""
 OPPOSITE = -1 + 1e-6
@@ -115,4 +114,4 @@ class LightKeys(Strict):
     @classmethod
     def read(cls, path: Path) -> "LightKeys":
         """Read and check a file; errors name the file and the field."""
-        return read_record(path, cls, SCHEMA)
+        return read_record(path, cls)

@@ -16,7 +16,6 @@ from service.server.api import (
     jobs,
     middleware,
     operations,
-    pictures,
     problems,
     results,
     stage,
@@ -60,7 +59,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     document.install(app)
     for router in (intakes.captures, importing.router, intakes.environments, intakes.samples, results.environments, uploads.router,
                    uploads.listings,
-                   uploads.options, jobs.router, events.router, results.router, pictures.router, hooks.router, operations.router):
+                   uploads.options, jobs.router, events.router, results.router, results.pictures, hooks.router, operations.router):
         app.include_router(router)
     pages.install(app)
     if set_stage is not None:

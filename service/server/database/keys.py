@@ -45,13 +45,8 @@ class Caller(NamedTuple):
         return ORDER.index(self.scope) >= ORDER.index(scope)
 
 
-def create(database: Database, wanted: NewKey) -> str:
-    """Create a key, and return it as its user sends it; it cannot be shown again."""
-    return database.transact(lambda connection: insert(connection, wanted))
-
-
 def insert(connection: sa.Connection, wanted: NewKey) -> str:
-    """Create a key in the caller's transaction, as `create` does."""
+    """Create a key, and return it as its user sends it; it cannot be shown again."""
     identifier, secret, now = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES), time.time()
     connection.execute(keys.insert().values(
         id=identifier, project=wanted.project, name=wanted.name, scope=wanted.scope, digest=_digest(secret), created_at=now,
@@ -87,13 +82,8 @@ def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
     return {row["id"] for row in database.rows(STILL_VALID, keys=list(identifiers), now=time.time())}
 
 
-def revoke(database: Database, identifier: str) -> bool:
-    """Revoke a key; return False if there is no such key or it was revoked before."""
-    return database.transact(lambda connection: withdraw(connection, identifier)) is not None
-
-
-def withdraw(connection: sa.Connection, identifier: str) -> str | None:
-    """Revoke a key in the caller's transaction; return its project, or None if there is no such key or it was revoked before."""
+def revoke(connection: sa.Connection, identifier: str) -> str | None:
+    """Revoke a key; return its project, or None if there is no such key or it was revoked before."""
     return connection.execute(keys.update().where(keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(
         revoked_at=time.time()).returning(keys.c.project)).scalar()
 

@@ -193,7 +193,7 @@ ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] =
     calibration_jobs.FlatFieldJob: (MEASURE, _product("service.calibrate.sensor:flat_field", calibrate.FlatFieldRequest, FILE_NAME)),
     calibration_jobs.SaturationJob: (MEASURE, _product("service.calibrate.sensor:saturation", calibrate.SaturationRequest, FILE_NAME,
                                                        write=True)),
-    calibration_jobs.WhiteBalanceJob: (MEASURE, _product("service.calibrate.white_balance:white_balance", calibrate.WhiteBalanceRequest,
+    calibration_jobs.WhiteBalanceJob: (MEASURE, _product("service.calibrate.sensor:white_balance", calibrate.WhiteBalanceRequest,
                                                          FILE_NAME)),
     calibration_jobs.ResponseJob: (MEASURE, _product("service.calibrate.response:response", calibrate.ResponseRequest, FILE_NAME)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),

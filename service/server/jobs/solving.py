@@ -26,8 +26,8 @@ def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> lis
     def step(name: str, number: int | None) -> JobStep:
         """Return the step that does the capture, or the time step `number` of a sequence."""
         if isinstance(request, SolveJob):
-            return JobStep(name, lambda progress: _solve(request, number, StepFiles(job, context, progress)),
-                           help=lambda progress: _help_solve(request, number, StepFiles(job, context, progress)))
+            return JobStep(name, lambda progress: _solve(request, number, StepFiles(job, context, progress), leads=True),
+                           help=lambda progress: _solve(request, number, StepFiles(job, context, progress), leads=False))
         return JobStep(name, lambda progress: _depth(request, number, StepFiles(job, context, progress)))
 
     count = intakes.time_steps(intakes.find(context.database, request.capture, job.project))
@@ -37,34 +37,22 @@ def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> lis
             JobStep(SEQUENCE, lambda progress: _join(request, StepFiles(job, context, progress)))]
 
 
-def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
-    from service.sequences.steps import solve_number
+def _solve(request: SolveJob, number: int | None, files: StepFiles, *, leads: bool) -> None:
+    """Solve a capture or a time step or, where another worker leads, do pieces of that."""
+    from service.sequences.steps import help_solve_number, solve_number
     from service.sharing.sharing import SharedSolve
-    from service.solve.solve import solve
+    from service.solve.solve import help_solve, solve
 
     pieces = JobPieces(files.context, files.job)
-    sharing = SharedSolve(pieces, leads=True, invite=pieces.invite)
+    sharing = SharedSolve(pieces, leads=True, invite=pieces.invite) if leads else SharedSolve(pieces, leads=False)
     wanted = _solve_request(request, number, files)
     if number is None:
-        solve(wanted, files.progress, sharing=sharing)
+        (solve if leads else help_solve)(wanted, files.progress, sharing=sharing)
     else:
         _fetch(wanted, files)
-        solve_number(wanted, number, files.progress, sharing)
-    pieces.remove()
-
-
-def _help_solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
-    from service.sequences.steps import help_solve_number
-    from service.sharing.sharing import SharedSolve
-    from service.solve.solve import help_solve
-
-    sharing = SharedSolve(JobPieces(files.context, files.job), leads=False)
-    wanted = _solve_request(request, number, files)
-    if number is None:
-        help_solve(wanted, files.progress, sharing)
-    else:
-        _fetch(wanted, files)
-        help_solve_number(wanted, number, files.progress, sharing)
+        (solve_number if leads else help_solve_number)(wanted, number, files.progress, sharing)
+    if leads:
+        pieces.remove()
 
 
 def _depth(request: DepthJob, number: int | None, files: StepFiles) -> None:

@@ -16,7 +16,8 @@ import shutil
 import sqlite3
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,16 +32,79 @@ from service.server.base.settings import Settings
 from service.server.database import tables
 from service.server.database.engine import Database, connect, usable
 from service.server.database.schema import require_current
-from service.server.storage import layout, saved_objects
+from service.server.storage import layout
 from service.server.storage.bucket import Bucket, Object
+from service.server.storage.folder import REMOVED, is_shown
+from service.server.storage.objects import TRANSFERS
 from service.server.storage.part_files import part_files_folder
-from stage.errors import storage
+from stage.errors import StorageError, storage
 from stage.files import write_text
+
+PROJECTS = "projects"
+"""Folder of captures and results, in the data folder and in the backup, and prefix of their objects."""
+TRIES = 5
+"""Times that an object is fetched that is replaced meanwhile."""
+
+
+class Differences(NamedTuple):
+    """Objects of a backup that the store has no longer as they were."""
+
+    missing: list[str]
+    changed: list[str]
+    """Objects with another size or another ETag."""
+
+
+def present(bucket: Bucket, *, pieces: bool) -> dict[str, Object]:
+    """Return the objects of captures, results and, with `pieces`, incomplete uploads by path, without those that are being deleted."""
+    removed = tuple(f"{found.path.removeprefix(f'{REMOVED}/')}/" for found in bucket.below(REMOVED))
+    found = [*bucket.below(PROJECTS), *(bucket.below(layout.PIECES) if pieces else ())]
+    return {each.path: each for each in found
+            if is_shown(each.path) and not each.path.startswith(removed) and not layout.is_shared(each.path)}
+
+
+def save(bucket: Bucket, folder: Path) -> dict[str, Object]:
+    """Copy the objects into a folder, and return those that were copied; one that is deleted meanwhile is left out."""
+    def fetch(found: Object) -> Object | None:
+        target = folder / found.path
+        with storage("write", target):
+            target.parent.mkdir(parents=True, exist_ok=True)
+        for left in reversed(range(TRIES)):
+            try:
+                bucket.fetch(found, target, lambda: None)
+                break
+            except (StorageError, FileNotFoundError):
+                again = bucket.find(found.path)
+                if again is None:
+                    target.unlink(missing_ok=True)
+                    return None
+                if again.version == found.version or not left:
+                    raise
+                found = again
+        with storage("write", target), open(target, "rb") as written:
+            os.fsync(written.fileno())
+            target.chmod(0o600)
+        return found
+
+    with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-backup") as pool:
+        return {found.path: found for found in pool.map(fetch, present(bucket, pieces=True).values()) if found is not None}
+
+
+def compare(bucket: Bucket, wanted: Mapping[str, tuple[int, str]]) -> Differences:
+    """Compare the objects of the store with those of a backup, each with its size and ETag."""
+    found = present(bucket, pieces=True)
+    return Differences([path for path in wanted if path not in found],
+                       [path for path, entry in wanted.items() if path in found and (found[path].size, found[path].version) != entry])
+
+
+def send(bucket: Bucket, folder: Path, paths: list[str]) -> None:
+    """Send copies into the store."""
+    with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-restore") as pool:
+        for _ in pool.map(lambda path: bucket.send(folder / path, path, lambda: None), paths):
+            pass
+
 
 SCHEMA = "relit.backup/1"
 CONTENTS, SQLITE, DUMP, OBJECTS = "backup.json", "relit.sqlite", "database.dump", "objects"
-PROJECTS = saved_objects.PROJECTS
-"""Folder of captures and results, in the data folder and in the backup."""
 BLOCK = 1 << 20
 
 
@@ -100,7 +164,7 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     contents: dict[str, Any] = {"schema": SCHEMA, "version": __version__, "at": at, "files": found}
     objects: dict[str, Object] = {}
     if bucket is not None:
-        objects = saved_objects.save(bucket, out / OBJECTS) if copy_objects else saved_objects.present(bucket, pieces=False)
+        objects = save(bucket, out / OBJECTS) if copy_objects else present(bucket, pieces=False)
         active |= _active_jobs(settings)
         contents["storage"] = {"url": bucket.url, "copied": copy_objects, "objects": {
             path: {"size": each.size, "version": each.version} | ({"changes": True} if layout.is_of_job(path, active) else {})
@@ -166,9 +230,9 @@ def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str
         raise RequestError(f"{folder}: is of a service with storage_url {stored['url']}: give this one, or another"
                            f"{'' if stored['copied'] else ' with the same objects'}")
     bucket, wanted = Bucket(settings.storage_url), stored["objects"]
-    missing, changed = saved_objects.compare(bucket, {path: (entry["size"], entry["version"]) for path, entry in wanted.items()})
+    missing, changed = compare(bucket, {path: (entry["size"], entry["version"]) for path, entry in wanted.items()})
     if stored["copied"]:
-        saved_objects.send(bucket, folder / OBJECTS, [*missing, *changed])
+        send(bucket, folder / OBJECTS, [*missing, *changed])
     else:
         changed = [path for path in changed if not wanted[path].get("changes")]  # its job went on after the backup
         if (missing or changed) and not accept_differences:

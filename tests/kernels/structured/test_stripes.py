@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
-from kernels.structured.pattern_frames import NoiseModel, saturated_bits, stack, upload
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from stage.patterns.binary import binary_patterns, xor_patterns
 from stage.patterns.codes import collect
 from tests.reference import structured as reference
@@ -176,23 +176,6 @@ def test_what_cannot_be_decoded_is_one_sentence(call, words, device):
 def test_what_cannot_be_uploaded_is_one_sentence(values, saturated, words, device):
     with pytest.raises(ArrayError, match=words):
         upload(values, saturated, device=device)
-
-
-def test_images_become_frames():
-    images = [np.arange(6.0).reshape(2, 3) + 10 * frame for frame in range(2)]
-    np.testing.assert_array_equal(stack(images), [[0, 1, 2, 3, 4, 5], [10, 11, 12, 13, 14, 15]])
-    colours = [np.stack([image, image + 100, image + 200], axis=-1) for image in images]
-    np.testing.assert_array_equal(stack(colours)[:, 1], stack(images) + 100)
-
-
-@pytest.mark.parametrize("images, words", [
-    ([], "there are no images"),
-    ([np.zeros((2, 3)), np.zeros((3, 2))], r"image 1 is \(3, 2\), image 0 is \(2, 3\): give images of one"),
-    ([np.zeros((2, 3)), np.zeros((2, 3, 3))], "image 1 is"),
-])
-def test_images_of_different_sizes_are_one_sentence(images, words):
-    with pytest.raises(ArrayError, match=words):
-        stack(images)
 
 
 def test_colour_frames_are_refused(device):

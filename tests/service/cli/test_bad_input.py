@@ -184,7 +184,7 @@ def test_bad_relights(relit, tmp_path, monkeypatch, fault):
 def relit_as_nobody(relit):
     """Run `relit ARGS` without the superuser's leave to pass over permissions."""
     import service.captures.info
-    import service.cli.commands.light
+    import service.cli.commands.captures
     import service.relight.relight
     import service.solve.solve  # noqa: F401  (from folders that may not be nobody's to read)
 

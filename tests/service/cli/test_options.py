@@ -36,7 +36,7 @@ from service.requests.base.options import build, help_text, options_of, typed, v
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
 from service.requests.imports import lights
 from service.requests.imports import patterns as pattern_images
-from service.requests.imports.interleaved import InterleavedImport
+from service.requests.imports.patterns import InterleavedImport
 from service.requests.imports.scans import ScansImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
 from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.light.light_keys import SCHEMA
 from stage.formats import exr
 from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 
@@ -32,7 +31,7 @@ def animate(relit, tmp_path, cap):
     """Relight frames 1-N by keys: [frames, 3] of the one colour that each frame has."""
 
     def run(count, keys, *options):
-        (tmp_path / "keys.json").write_text(json.dumps({"schema": SCHEMA, **keys}))
+        (tmp_path / "keys.json").write_text(json.dumps({"schema": "relit.keys/1", **keys}))
         relit.done("relight", cap, "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr",
                    "--frames", f"1-{count}", *options)
         return np.array([[exr.read(tmp_path / "f" / f"a.{n}.exr")[0][c].astype(float).mean() for c in "RGB"]
@@ -142,7 +141,7 @@ BAD_KEYS = {
 @pytest.mark.parametrize("fault", BAD_KEYS)
 def test_bad_keys(relit, tmp_path, cap, fault):
     content, words = BAD_KEYS[fault]
-    text = content if isinstance(content, str) else json.dumps({"schema": SCHEMA, **content})
+    text = content if isinstance(content, str) else json.dumps({"schema": "relit.keys/1", **content})
     (tmp_path / "keys.json").write_text(text)
     before = files_in(tmp_path)
     outcome = relit("relight", cap, "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr")
@@ -151,7 +150,7 @@ def test_bad_keys(relit, tmp_path, cap, fault):
 
 
 def test_spin_and_keys_do_not_both_turn(relit, tmp_path, cap):
-    (tmp_path / "keys.json").write_text(json.dumps({"schema": SCHEMA, "environment": [{"frame": 1, "turn_degrees": 5}]}))
+    (tmp_path / "keys.json").write_text(json.dumps({"schema": "relit.keys/1", "environment": [{"frame": 1, "turn_degrees": 5}]}))
     sky = write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))
     outcome = relit("relight", cap, "--keys", tmp_path / "keys.json", "--environment", sky, "--spin-degrees", "9",
                     "--out", tmp_path / "a.#.exr")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from service.relight import combine
-from service.requests.light.light_keys import SCHEMA
 from stage.errors import StorageError
 from stage.formats import exr
 from tests.scenes.captures import files_in, make_scene, write_capture, write_exr, write_image
@@ -16,7 +15,7 @@ SIZE = 200
 """Rows of more than one block, the last of which is neither a multiple of a chunk nor of a pack."""
 SCENE = make_scene(size=SIZE, lights=6)
 KEY = {"frame": 1, "direction": [0, 3, 1], "irradiance": [1, 1, 3], "angle_degrees": 2}
-KEYS = {"schema": SCHEMA, "lights": [{"name": "key", "keys": [KEY]}]}
+KEYS = {"schema": "relit.keys/1", "lights": [{"name": "key", "keys": [KEY]}]}
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 from service.requests.base.identifiers import ENVIRONMENT
@@ -56,7 +57,7 @@ checks.positive_data_acceptance.expected-statuses = ["204", "400", "401", "403",
 def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
     """A key, and captures, environments and jobs in several states; no worker is needed."""
     house = House(settings.data, database_url=settings.database_url)
-    key = keys.create(house.database, NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN))
+    key = house.database.transact(partial(keys.insert, wanted=NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN)))
     captures, environments = [house.capture() for _ in range(3)], [house.capture(ENVIRONMENT) for _ in range(2)]
     for ready in (*captures[:2], environments[0]):
         house.database.transact(lambda connection, ready=ready: intakes.begin_check(connection, ready))

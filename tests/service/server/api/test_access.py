@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import time
+from functools import partial
 from typing import NamedTuple
 
 import httpx2
@@ -120,15 +121,15 @@ def test_what_is_no_key_of_ours_or_revoked_is_refused(site):
     key = site.server.key("larch", Scope.ADMIN)
     with site.server.client(key) as client:
         assert client.get("/v1/jobs").status_code == 200
-        assert keys.revoke(site.database, key.partition(".")[0])
+        assert site.database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
         assert client.get("/v1/jobs").status_code == 401
-        assert not keys.revoke(site.database, key.partition(".")[0])
+        assert not site.database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
 
 
 def test_a_key_that_was_refused_is_told_why_if_its_secret_is_right(site):
     good, revoked = site.server.key("larch"), site.server.key("larch")
-    keys.revoke(site.database, revoked.partition(".")[0])
-    expired = keys.create(site.database, NewKey(project="larch", name="test", scope=Scope.READ, expires_days=1e-9))
+    site.database.transact(partial(keys.revoke, identifier=revoked.partition(".")[0]))
+    expired = site.database.transact(partial(keys.insert, wanted=NewKey(project="larch", name="test", scope=Scope.READ, expires_days=1e-9)))
     said = {"this service does not know the key": ("x", f"{good}x", f"{revoked}x", f"{expired}x"), "the key was revoked on": (revoked,),
             "the key expired on": (expired,)}
     with site.server.client() as client:

@@ -11,9 +11,8 @@ from service.calibrate.chart import calibrate_chart
 from service.calibrate.laser_planes import laser_planes
 from service.calibrate.procam import procam
 from service.calibrate.response import response
-from service.calibrate.sensor import dark, flat_field, saturation
+from service.calibrate.sensor import dark, flat_field, saturation, white_balance
 from service.calibrate.tof import calibrate_tof
-from service.calibrate.white_balance import white_balance
 from service.requests import calibrate as requests
 from service.requests.chart import ChartRequest
 from tests.reference import tof

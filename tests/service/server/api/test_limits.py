@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ class Site(NamedTuple):
     database: Database
 
     def key(self) -> str:
-        return keys.create(self.database, NewKey(project="larch", name="test", scope=Scope.ADMIN))
+        return self.database.transact(partial(keys.insert, wanted=NewKey(project="larch", name="test", scope=Scope.ADMIN)))
 
     def client(self, key: str) -> TestClient:
         return TestClient(self.app, headers={"Authorization": f"Bearer {key}"})

@@ -1,6 +1,7 @@
 """The sample that comes with Relit, registered by one request, and the project that a key is told it belongs to."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 from fastapi.testclient import TestClient
@@ -22,7 +23,7 @@ def of(tmp_path_factory) -> Iterator[Callable[..., TestClient]]:
     settings = Settings(data=tmp_path_factory.mktemp("samples"), project_quotas="elm:max_project_captures=1", min_free_bytes=0)
     with app_of(settings) as app:
         def client(project: str, scope: Scope = Scope.WRITE) -> TestClient:
-            key = keys.create(app.state.service.database, NewKey(project=project, name="test", scope=scope))
+            key = app.state.service.database.transact(partial(keys.insert, wanted=NewKey(project=project, name="test", scope=scope)))
             return TestClient(app, base_url="http://localhost", headers={"Authorization": f"Bearer {key}"})
 
         yield client

@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import pytest
 from fastapi.testclient import TestClient
@@ -190,11 +191,12 @@ def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(tmp_path, monkeypatch
     write_body = api_uploads.write_body
     with app_of(Settings(data=tmp_path / "data", min_free_bytes=0)) as app:
         database = app.state.service.database
-        key, other = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.WRITE)) for _ in range(2))
+        wanted = NewKey(project="larch", name="x", scope=Scope.WRITE)
+        key, other = (database.transact(partial(keys.insert, wanted=wanted)) for _ in range(2))
 
         async def write_and_revoke(*arguments) -> None:
             await write_body(*arguments)
-            keys.revoke(database, key.partition(".")[0])
+            database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
 
         monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
         with TestClient(app, headers={"Authorization": f"Bearer {key}", "Tus-Resumable": "1.0.0"}) as client:

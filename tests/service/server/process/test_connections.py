@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 
 import httpx2
 import pytest
@@ -208,7 +209,7 @@ def test_the_stream_of_a_revoked_key_ends(tmp_path):
         with server.client(revoked) as one, server.client(kept) as two, server.database() as database:
             with one.stream("GET", "/v1/events") as ending, two.stream("GET", "/v1/events") as staying:
                 assert ending.status_code == staying.status_code == 200
-                assert keys.revoke(database, revoked.partition(".")[0])
+                assert database.transact(partial(keys.revoke, identifier=revoked.partition(".")[0]))
                 assert list(ending.iter_lines()) == []
                 assert not staying.is_closed
             assert one.get("/v1/events").status_code == 401

@@ -1,6 +1,7 @@
 """relit doctor, of a service."""
 
 import sqlite3
+from functools import partial
 
 import pytest
 
@@ -26,7 +27,7 @@ def database(data):
     settings = Settings(data=data)
     made = connect(settings.sqlalchemy_url)
     prepare(settings, made)
-    keys.create(made, NewKey(project="larch", name="x", scope=Scope.READ))
+    made.transact(partial(keys.insert, wanted=NewKey(project="larch", name="x", scope=Scope.READ)))
     yield made
     made.close()
 
@@ -75,7 +76,7 @@ def wrong(relit, *arguments: object) -> list[str]:
 
 
 def test_no_key_and_jobs_that_wait_for_nobody(relit, data, database, monkeypatch):
-    keys.revoke(database, keys.listing(database)[0]["id"])
+    database.transact(partial(keys.revoke, identifier=keys.listing(database)[0]["id"]))
     (line,) = wrong(relit, "--data", data)
     assert line.startswith("keys: none") and "relit keys create" in line
     monkeypatch.setenv("RELIT_ANONYMOUS", "true")

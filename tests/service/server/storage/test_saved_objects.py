@@ -8,8 +8,8 @@ import pytest
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.base.settings import Settings
 from service.server.database import jobs
-from service.server.process.backup import CONTENTS, backup, restore
-from service.server.storage import layout, saved_objects
+from service.server.process.backup import CONTENTS, backup, restore, save
+from service.server.storage import layout
 from service.server.storage.bucket import Bucket
 from stage.errors import StorageError
 from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
@@ -128,7 +128,7 @@ def test_an_object_that_is_replaced_or_deleted_while_it_is_copied(store, tmp_pat
         fetch(self, found, target, moved)
 
     monkeypatch.setattr(Bucket, "fetch", disturbed)
-    saved = saved_objects.save(store, tmp_path / "copies")
+    saved = save(store, tmp_path / "copies")
     assert set(saved) == {MAPS, PIECE} and saved[MAPS].size == len(b"newer maps")
     assert (tmp_path / "copies" / MAPS).read_bytes() == b"newer maps" and not (tmp_path / "copies" / FRAME).exists()
 
