@@ -1,5 +1,7 @@
 /** Elements of a page, and values as people read them. */
 
+const ICONS = new URL("look/icons.svg", import.meta.url).pathname;
+
 /**
  * Make an element.
  * @param {string} tag Name of the element.
@@ -100,7 +102,7 @@ export function icon(name) {
   const [drawing, use] = ["svg", "use"].map((tag) => document.createElementNS("http://www.w3.org/2000/svg", tag));
   drawing.setAttribute("class", "icon");
   drawing.setAttribute("aria-hidden", "true");
-  use.setAttribute("href", `/static/look/icons.svg#${name}`);
+  use.setAttribute("href", `${ICONS}#${name}`);
   drawing.append(use);
   return drawing;
 }

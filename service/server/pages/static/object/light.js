@@ -2,7 +2,7 @@
 
 import { attempt, submitJob } from "../api.js";
 import { element } from "../element.js";
-import { loadEnvironment, readyEnvironments } from "../environments.js";
+import { loadEnvironment } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
 import { mount } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
@@ -16,9 +16,10 @@ const FOUND = "The lights of this picture are those that the solve has found. Fr
  * @param {HTMLElement} parent Takes it.
  * @param {string} capture Identifier.
  * @param {import("../view/view_file.js").ViewFile} view Of it.
+ * @param {{id: string, name: string}[]} environments Of the server.
  * @param {{canRender?: boolean}} [options] Whether the batch can render it: the lights are those of the capture, and not of a solve alone.
  */
-export async function mountLight(parent, capture, view, { canRender = true } = {}) {
+export async function mountLight(parent, capture, view, environments, { canRender = true } = {}) {
   const batch = {
     last: element("input", { type: "text", inputmode: "numeric", value: "24", size: 5, autocomplete: "off" }),
     spin: element("input", { type: "text", inputmode: "decimal", value: "360", size: 6, autocomplete: "off" }),
@@ -85,7 +86,6 @@ export async function mountLight(parent, capture, view, { canRender = true } = {
   }
 
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
-  const environments = await readyEnvironments();
   const [stage, notes] = [element("div"), element("div")];
   parent.replaceChildren(stage, notes, canRender ? batchForm() : element("p", { class: "help" }, FOUND));
   const viewer = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });

@@ -85,7 +85,7 @@ function toObject() {
 }
 
 async function look(facts) {
-  const step = await chosenStep(identifier);
+  const step = await chosenStep(facts);
   const { files } = await openView(identifier, null, step, byId("preparing"));
   const view = await ViewFile.open(files);
   if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier, [], toObject);
