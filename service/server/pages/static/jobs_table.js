@@ -19,6 +19,7 @@ export function progressOf(job) {
 /** Jobs in the body of a table, the newest first. */
 export class JobsTable {
   #rows = new Map();
+  #revisions = new Map();
   #body;
   #wanted;
 
@@ -38,7 +39,8 @@ export class JobsTable {
 
   /** Show a job as it is now. */
   put(job) {
-    if (!this.#wanted(job)) return;
+    if (!this.#wanted(job) || job.revision < this.#revisions.get(job.id)) return; // an answer that was overtaken
+    this.#revisions.set(job.id, job.revision);
     const row = element("tr", { "data-created": job.created_at },
       element("td", {}, element("a", { href: `/jobs/${job.id}` }, titleOf(job)), " ", element("small", {}, job.id)),
       element("td", {}, element("span", { class: `state ${job.state}` }, job.state)),

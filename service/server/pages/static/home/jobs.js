@@ -28,8 +28,13 @@ export class Jobs {
 
   /** Know a job that was submitted, before the server tells of it. */
   take(job) {
-    this.#jobs.set(job.id, job);
+    this.#know(job);
     this.#changed(job);
+  }
+
+  /** Keep a job as it is now, unless a later answer has come before. */
+  #know(job) {
+    if (!(job.revision < this.#jobs.get(job.id)?.revision)) this.#jobs.set(job.id, job);
   }
 
   async load() {
@@ -44,7 +49,7 @@ export class Jobs {
     return watch("/v1/events", {
       job: async (job) => {
         const isNew = this.#jobs.get(job.id)?.state !== job.state;
-        this.#jobs.set(job.id, job);
+        this.#know(job);
         if (isNew && job.state === "queued") await this.#askWhatIsWrong();
         this.#changed(job);
       },

@@ -4,6 +4,7 @@ import { attempt, submitJob } from "../api.js";
 import { element } from "../element.js";
 import { loadEnvironment } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
+import { once } from "../once.js";
 import { mount } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
 import { mountVideo } from "./video.js";
@@ -67,8 +68,7 @@ export async function mountLight(parent, capture, view, environments, { canRende
     }
   }
 
-  async function submit(event) {
-    event.preventDefault();
+  async function submit() {
     present();
     if (!batch.fault.hidden) return;
     const job = await submitJob(request());
@@ -78,7 +78,7 @@ export async function mountLight(parent, capture, view, environments, { canRende
   function batchForm() {
     for (const each of [batch.last, batch.spin]) each.addEventListener("input", present);
     return element("section", { "aria-label": "Frames" }, element("h2", {}, "Render these frames"),
-      element("form", { novalidate: true, onsubmit: (event) => attempt(() => submit(event)) },
+      element("form", { novalidate: true, onsubmit: (event) => { event.preventDefault(); attempt(() => once(event.target, submit)); } },
         element("p", { class: "actions" }, element("label", {}, "Frames ", batch.last), element("label", {}, "Spin of the environment (degrees) ", batch.spin),
           element("button", { type: "submit" }, "Render")), batch.fault,
         element("details", { class: "same-as" }, element("summary", {}, "The same as a command"), batch.command, element("p", {}, "with this keys.json:"), batch.keys,

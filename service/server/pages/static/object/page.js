@@ -4,6 +4,7 @@ import { attempt, listing, load, read } from "../api.js";
 import { byId, element, factText, show, words } from "../element.js";
 import { readyEnvironments } from "../environments.js";
 import { Address, writeNow } from "../publish/address.js";
+import { newest } from "../once.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
@@ -113,8 +114,11 @@ await load(async () => {
   const step = await chosenStep(capture.facts);
   const view = await ViewFile.open((await openView(identifier, null, step, byId("view"))).files);
   const facts = litFacts(capture.facts ?? {}, view);
+  const asked = newest();
   const work = new Work(byId("work"), async () => {
+    const isNewest = asked();
     const now = await jobsOfObject();
+    if (!isNewest()) return; // another job has ended meanwhile, and its look sees both
     takeModes(modesOf(identifier, view, step, now, facts, environments));
     await present(now, facts, work);
   });

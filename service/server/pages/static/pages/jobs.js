@@ -4,6 +4,7 @@ import { attempt, load, read } from "../api.js";
 import { byId, show } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
+import { once } from "../once.js";
 import { JobsTable } from "../jobs_table.js";
 
 const table = new JobsTable(byId("jobs"));
@@ -17,6 +18,6 @@ async function more() {
 }
 
 enableForms(byId("work"), "");
-byId("more").addEventListener("click", () => attempt(more));
+byId("more").addEventListener("click", () => attempt(() => once(byId("more"), more)));
 await load(more);
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

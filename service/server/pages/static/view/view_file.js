@@ -49,10 +49,12 @@ export class ViewFile {
       else parts.push({ begin: offset, end: offset + length });
     }
     for (const part of parts) part.bytes = this.raw(part.begin, part.end - part.begin);
-    return places.map(async ([offset, length]) => {
+    const found = places.map(async ([offset, length]) => {
       const { begin, bytes } = parts.findLast((part) => part.begin <= offset);
       return inflated(new Uint8Array(await bytes, offset - begin, length));
     });
+    for (const each of found) each.catch(() => {}); // whoever waits for it is told
+    return found;
   }
 
   /** Return bytes of view.bin as they are. */

@@ -50,6 +50,10 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const zoomed = mountZoomed(stage, front, place, { changed: onGesture, pixelSize, still: embedded });
   const { canvas } = zoomed;
   stage.append(warning);
+  let loop = null; // until the picture can be drawn here
+  let map = null; // { id, name, profile }
+  let chosen = null; // stands for the environment that was chosen last, which may still come
+  let asked = false;
 
   const address = embedded ? null : new ControlAddress({ on: control.lit, brightness: control.brightness, colour: control.colour, size: control.size,
     environment: control.environment, "environment-stops": control.environmentStops, turn: control.turn, stops: control.exposure, view: control.view,
@@ -76,11 +80,8 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const exposure = new Exposure(relight, matte, tiles);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
   const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
-  let map = null; // { id, name, profile }
-  let chosen = null; // stands for the environment that was chosen last, which may still come
-  let asked = false;
   const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
-  const loop = new DrawLoop(renderer, show);
+  loop = new DrawLoop(renderer, show);
 
   /** Show the object as the server has lit it, until it is lit here. */
   async function showCard(picture) {
@@ -121,6 +122,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   }
 
   function change() {
+    if (loop === null) return;
     for (const each of Object.values(control)) each.dispatchEvent(new Event("set"));
     domeControl.set(control.lit.checked ? place.light : null);
     address?.write();
