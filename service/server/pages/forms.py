@@ -5,6 +5,7 @@ command.
 """
 
 from enum import Enum
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
@@ -113,6 +114,7 @@ class Form(NamedTuple):
     """What there must be one of, as BEGIN_WITH says; empty: the job begins with nothing."""
 
 
+@cache
 def form_of(kind: str, model: type[JobRequest]) -> Form:
     """Return the form of a kind of job."""
     places: dict[str, list[str]] = {}

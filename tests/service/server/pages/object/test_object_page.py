@@ -269,7 +269,7 @@ def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
     page.mouse.move(middle[0] + 60, middle[1] + 40)
     page.mouse.up()
     page.get_by_label("Text of the note").fill("a region")
-    page.get_by_role("button", name="Keep the note").click()
+    page.get_by_role("button", name="Keep the note").dblclick()
     page.locator(".notes > button").nth(1).wait_for()
     page.locator("canvas.picture").focus()
     page.keyboard.press("+")  # the marks go with the picture
