@@ -2,7 +2,6 @@
 
 import { listing, read } from "../api.js";
 import { watch } from "../events.js";
-import { kindTitle } from "../element.js";
 
 const MOST_FAILED = 10;
 
@@ -62,10 +61,4 @@ export class Jobs {
     const answer = await fetch("/readyz");
     this.fault = answer.ok ? "" : (await answer.json()).detail;
   }
-}
-
-/** Return what a job is called, with the capture that it is about; `nameOf` gives the name of a capture or environment, or undefined. */
-export function titleOf({ request }, nameOf) {
-  const about = nameOf(request.capture ?? request.intake);
-  return request.name || (about === undefined ? kindTitle(request.kind) : `${kindTitle(request.kind)} · ${about}`);
 }

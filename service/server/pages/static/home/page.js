@@ -4,10 +4,11 @@ import { attempt, load, newToken, postOnce, read, Refusal, send } from "../api.j
 import { isUnderWay, mountDropZone } from "../upload/drop_zone.js";
 import { byId, setChildren, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
+import { titleOf } from "../jobs_table.js";
 import { newest } from "../once.js";
 import { cardOf, setPicture } from "./card.js";
 import { assetItem, chosen, intakeItem, itemsOf } from "./items.js";
-import { Jobs, titleOf } from "./jobs.js";
+import { Jobs } from "./jobs.js";
 import { environmentPicture, pictureOf } from "./picture.js";
 import { showStrip } from "./strip.js";
 

@@ -1,7 +1,7 @@
 /** The modes of an object: what there is to show of it, and how each is shown. */
 
 import { attempt } from "../api.js";
-import { element } from "../element.js";
+import { element, kindTitle } from "../element.js";
 import { mountAsset } from "./asset.js";
 import { mountFrames } from "./frames.js";
 import { mountLight } from "./light.js";
@@ -43,7 +43,7 @@ export function modesOf(identifier, view, step, jobs, facts, environments) {
 
 /** Return what a job is called beside others of the object. */
 function nameOf(job) {
-  return `${job.request.name || job.request.options?.method || job.request.kind} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
+  return `${job.request.name || job.request.options?.method || kindTitle(job.request.kind)} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
 }
 
 async function mountPhotographed(parent, view) {

@@ -1,7 +1,7 @@
 /** The page of one object: what was captured and what was made of it, as modes of one view. Its address says which is shown, and how. */
 
 import { attempt, listing, load, read } from "../api.js";
-import { byId, element, factText, show, words } from "../element.js";
+import { byId, element, factRows, show } from "../element.js";
 import { readyEnvironments } from "../environments.js";
 import { Address, writeNow } from "../publish/address.js";
 import { newest } from "../once.js";
@@ -105,7 +105,7 @@ await load(async () => {
   const [capture, jobs, environments] = await Promise.all([read(`/v1/captures/${identifier}`), jobsOfObject(), readyEnvironments()]);
   byId("name").textContent = capture.name;
   document.title = `${capture.name} · Relit`;
-  byId("facts").replaceChildren(...Object.entries(capture.facts ?? {}).flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
+  byId("facts").replaceChildren(...factRows(capture.facts ?? {}));
   byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, capture.name, "/captures"));
   if (capture.state !== "ready") {
     byId("view").replaceChildren(element("p", {}, `${capture.problem ?? `This capture is ${capture.state}.`} `, element("a", { href: `/captures/${identifier}` }, "Its page says more.")));

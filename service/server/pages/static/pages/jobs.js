@@ -7,7 +7,8 @@ import { enableForms } from "../form.js";
 import { once } from "../once.js";
 import { JobsTable } from "../jobs_table.js";
 
-const table = new JobsTable(byId("jobs"));
+const names = new Map(); // of captures and environments
+const table = new JobsTable(byId("jobs"), () => true, (id) => names.get(id));
 let next = null;
 
 async function more() {
@@ -19,5 +20,9 @@ async function more() {
 
 enableForms(byId("work"), "");
 byId("more").addEventListener("click", () => attempt(() => once(byId("more"), more)));
-await load(more);
+await load(async () => {
+  const lists = await Promise.all(["captures", "environments"].map((list) => read(`/v1/${list}?limit=500`)));
+  for (const { id, name } of lists.flatMap(({ items }) => items)) names.set(id, name);
+  await more();
+});
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

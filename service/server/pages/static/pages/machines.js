@@ -68,6 +68,7 @@ async function audit() {
   const page = await read(next === null ? "/v1/audit?limit=50" : `/v1/audit?limit=50&before=${next}`);
   byId("audit").tBodies[0].append(...page.entries.map((entry) => element("tr", {}, element("td", {}, time(entry.at)), element("td", {}, entry.actor),
     element("td", {}, words(entry.action).replace(".", ": ")), element("td", {}, objectLink(entry.object)), element("td", {}, entry.request ?? "command line"))));
+  if (page.entries.length === 0 && next === null) byId("audit").tBodies[0].append(element("tr", {}, element("td", { colspan: 5 }, "Nobody has changed anything yet.")));
   next = page.next;
   show(byId("more"), next !== null);
 }
