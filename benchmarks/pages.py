@@ -80,7 +80,8 @@ def main() -> int:
         places = {"/": "/", "captures": "/captures", "jobs": "/jobs", "machines": "/machines", "capture": f"/captures/{owl}",
                   "job": f"/jobs/{solved}", "light": f"/light/{owl}", "object": f"/object/{owl}", "maps": f"/maps/{solved}",
                   "asset": f"/asset/{asset}"}
-        print("| page | first paint, ms | what it is opened for, ms | all of it, ms | longest task, ms | layout shift | loaded without data, kB |")
+        print("| page | first paint, ms | what it is opened for, ms | all of it, ms | longest task, ms | layout shift |",
+              "loaded without data, kB |")
         print("|---|---:|---:|---:|---:|---:|---:|")
         for name, path in places.items():
             _print_loads(browser, server.url, name, path)

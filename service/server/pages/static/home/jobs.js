@@ -37,11 +37,10 @@ export class Jobs {
   }
 
   async load() {
-    for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#jobs.set(job.id, job);
-    const { jobs } = await read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`);
-    for (const job of jobs) this.#jobs.set(job.id, job);
+    const failed = read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`).then(({ jobs }) => jobs.forEach((job) => this.#know(job)));
+    const active = async () => { for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#know(job); };
+    await Promise.all([failed, active()]);
     await this.#askWhatIsWrong();
-    this.#changed(null);
   }
 
   follow() {

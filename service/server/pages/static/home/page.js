@@ -16,7 +16,7 @@ const LISTS = ["captures", "environments", "assets"];
 const PAGE = 60; // cards that are added at once
 const items = new Map();
 const cards = new Map(); // of the items that have been shown
-const refreshed = {}; // by the identifier of what was asked for again
+const refreshed = {}; // by the name of a list or the identifier of what was asked for again
 const asked = new Set(); // captures whose view this page has asked for
 let most = PAGE;
 let isLoaded = false;
@@ -164,7 +164,10 @@ async function showProject() {
 }
 
 async function fill(list) {
-  for await (const item of itemsOf(list)) put(item);
+  const isNewest = (refreshed[list] ??= newest())();
+  const found = await itemsOf(list);
+  if (!isNewest()) return;
+  found.forEach(put);
   draw();
 }
 
@@ -191,10 +194,10 @@ closeDropZone();
 
 attempt(showProject); // the cards do not wait for it
 await load(async () => {
-  await fill("captures");
-  await Promise.all([...LISTS.slice(1).map(fill), jobs.load()]);
+  const [lists] = await Promise.all([Promise.all(LISTS.map(itemsOf)), jobs.load()]);
+  lists.flat().forEach(put); // captures first, whose pictures and names assets have
   isLoaded = true;
   draw();
-  prepareNext();
+  changed(null);
 });
 await attempt(() => jobs.follow());

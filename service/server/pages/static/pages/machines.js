@@ -81,13 +81,12 @@ function objectLink(name) {
 byId("more").addEventListener("click", () => attempt(() => once(byId("more"), audit)));
 await load(async () => {
   try {
-    await look();
+    await Promise.all([look(), audit()]);
   } catch (error) {
     if (!(error instanceof Refusal) || error.status !== 403) throw error;
     byId("refused").textContent = `This page is for operators: ${error.message}. Give a key of that scope with the button Key above.`;
     show(byId("refused"), true);
     return;
   }
-  await audit();
   setInterval(() => document.visibilityState === "visible" && attempt(look), REFRESH_MS);
 });
