@@ -99,7 +99,7 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
         found["jobs"] = [{**job, "state": "running"} if job["request"].get("maps") else job for job in found["jobs"]]
         route.fulfill(response=answer, json=found)
 
-    page.route("**/v1/jobs?limit=500&state=succeeded&state=queued&state=running", unprepared)
+    page.route("**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", unprepared)
     page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
     page.goto(f"{made.pages['object']}#mode=photographs")
     page.locator("[data-shows=photographs] figure canvas").first.wait_for()
