@@ -98,7 +98,7 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
 def test_arrow_keys_move_the_light(page, solved):
     """Also while the first picture stands for one that is still loaded."""
     held = []
-    page.route("**/view.bin", held.append)
+    page.route("**/view.bin", lambda route: held.append(route))
     page.goto(f"/light/{solved.capture}")
     page.locator("canvas.picture[data-shown=card]").press("ArrowRight")
     seen(page, lambda: held, "no block is asked for")
