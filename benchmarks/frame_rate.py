@@ -33,7 +33,8 @@ DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
   const canvas = document.querySelector('canvas');
   [canvas.width, canvas.height] = [side, side];
   const relight = { rows: side, cols: side, terms: layers, tiles: { side: tile, rows: across, cols: across, count } };
-  const renderer = new BasisRenderer(canvas, relight, 'lin_rec709_scene', Uint16Array.from({ length: count }, (_, index) => index));
+  const renderer = new BasisRenderer(canvas, relight, 'lin_rec709_scene');
+  renderer.setTiles(Uint16Array.from({ length: count }, (_, index) => index));
   const random = Uint16Array.from({ length: 3 * side * side }, () => 0x2800 + Math.floor(0x800 * Math.random())); // halves 0.03 to 0.13
   for (let term = 0; term < layers; term += 1) await renderer.setTerm(term, random);
   renderer.setMatte(new Uint8Array(side * side).fill(255));

@@ -5,6 +5,7 @@ command.
 """
 
 from enum import Enum
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
@@ -66,7 +67,7 @@ NEXT_STEPS: dict[str, tuple[str, ...]] = {
 """What a capture is made for, by what it holds: jobs that need nothing but the capture. A capture that can be relit is lit first."""
 UNITS = {"px": "pixels", "m": "metres", "s": "seconds", "hz": "Hz", "deg": "degrees", "degrees": "degrees", "c": "°C"}
 """Units in words, by what ends the name of a field in them."""
-WORDS = {"focal_px": "Focal length (pixels)", "principal_px": "Principal point (pixels)",
+WORDS = {"color_space": "Colour space", "focal_px": "Focal length (pixels)", "principal_px": "Principal point (pixels)",
          "surface_z_m": "Distance of the surface, z (metres)",
          "ball_z_m": "Distance of the ball, z (metres)", "must_find_m": "Defects that must be found (metres)"}
 """Labels of fields whose names are too short for people."""
@@ -113,6 +114,7 @@ class Form(NamedTuple):
     """What there must be one of, as BEGIN_WITH says; empty: the job begins with nothing."""
 
 
+@cache
 def form_of(kind: str, model: type[JobRequest]) -> Form:
     """Return the form of a kind of job."""
     places: dict[str, list[str]] = {}

@@ -6,6 +6,9 @@ Pages load nothing from another server: the content security policy allows scrip
 import base64
 import hashlib
 import json
+import posixpath
+import re
+from functools import cache
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
@@ -15,6 +18,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from starlette.types import Scope
 
 from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
@@ -23,7 +27,12 @@ from service.requests.jobs import JOBS
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, Form, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))
-STATIC = "/static"
+SHARED = Path(str(files("service.publish"))) / "static"
+"""Modules that published pages have too."""
+LOADED = sorted(path for folder in (HOME / "static", SHARED) for path in folder.rglob("*.*") if path.is_file())
+VERSION = hashlib.sha256(b"".join(path.read_bytes() for path in LOADED)).hexdigest()[:12]
+STATIC = f"/static/v-{VERSION}"
+"""The address of the files that pages load. It changes with them, so that a browser keeps them without asking again."""
 THREE = f"{STATIC}/vendor/three"
 IMPORT_MAP = json.dumps({"imports": {"three": f"{THREE}/three.module.js", "three/addons/": f"{THREE}/addons/"}})
 """The places where modules find three.js, which is vendored."""
@@ -37,6 +46,8 @@ HEADERS = {
 }
 """Headers of every page. Loaders of three.js read textures through blob: addresses, which they make themselves."""
 
+IMPORT = re.compile(r'^import (?:[^"]* from )?"(\.[^"]+)"', re.MULTILINE)
+"""An import of a module by its relative address."""
 NAVIGATION = [("/", "Home"), ("/captures", "Captures"), ("/jobs", "Jobs"), ("/machines", "Machines")]
 """Addresses and names of the pages in the header."""
 
@@ -51,20 +62,37 @@ templates.globals.update({name: getattr(templates.get_template("parts.html").mod
 
 
 class StaticModules(StaticFiles):
-    """The files that pages load; a browser asks each time whether its copy is the newest."""
+    """The files that pages load; a browser keeps those of this version, and asks about others each time."""
 
-    def file_response(self, *args: Any, **kwargs: Any) -> Response:
-        """Return a file, with headers that forbid a guess of its type and a use without question."""
-        response = super().file_response(*args, **kwargs)
-        response.headers.update({"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"})
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """Return a file, with headers that forbid a guess of its type and say how long it may be used."""
+        response = await super().get_response(path, scope)
+        kept = "max-age=31536000, immutable" if scope["path_params"].get("version") == VERSION else "no-cache"
+        response.headers.update({"Cache-Control": kept, "X-Content-Type-Options": "nosniff"})
         return response
 
 
 def install(app: FastAPI) -> None:
     """Add the pages and their files to the app."""
     app.include_router(router)
-    app.mount(f"{STATIC}/publish", StaticModules(packages=[("service.publish", "static")]), name="modules shared with published pages")
-    app.mount(STATIC, StaticModules(directory=HOME / "static"), name="static")
+    for address in ("/static/v-{version}", "/static"):  # a page of another version gets what there is now
+        for below, folder in (("/publish", SHARED), ("", HOME / "static")):
+            app.mount(f"{address}{below}", StaticModules(directory=folder))
+
+
+@cache
+def modules_of(module: str) -> tuple[str, ...]:
+    """Return the addresses of a module and of all that it imports at once, which a page names so that a browser asks for them together."""
+    found = [f"{STATIC}/{module}"]
+    for each in found:  # grows
+        below = each.removeprefix(f"{STATIC}/")
+        text = (SHARED / below.removeprefix("publish/") if below.startswith("publish/") else HOME / "static" / below).read_text()
+        named = (posixpath.normpath(posixpath.join(posixpath.dirname(each), name)) for name in IMPORT.findall(text))
+        found += [name for name in dict.fromkeys(named) if name not in found]
+    return tuple(found)
+
+
+templates.globals["modules_of"] = modules_of
 
 
 @router.get("/")

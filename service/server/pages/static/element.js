@@ -1,5 +1,7 @@
 /** Elements of a page, and values as people read them. */
 
+const ICONS = new URL("look/icons.svg", import.meta.url).pathname;
+
 /**
  * Make an element.
  * @param {string} tag Name of the element.
@@ -77,9 +79,9 @@ export function time(iso) {
   return element("time", { datetime: iso, title: when.toString() }, when.toLocaleString([], { dateStyle: "medium", timeStyle: "short" }));
 }
 
-/** Return the words of a fact's name: `color_space` is `Color space`. */
+/** Return the words of a name: `color_space` is `Colour space`. */
 export function words(name) {
-  const text = name.replaceAll("_", " ");
+  const text = name.replace("color", "colour").replaceAll("_", " ");
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
@@ -88,8 +90,14 @@ export function kindTitle(kind) {
   return JSON.parse(document.body.dataset.titles)[kind] ?? words(kind);
 }
 
+/** Return the facts of a capture as rows of a list, without what its page says elsewhere. */
+export function factRows({ captures, name, lit_by: litBy, calibrated, proposal, ...facts }) {
+  const shown = captures > 1 ? { captures, ...facts } : facts;
+  return Object.entries(shown).flatMap(([fact, value]) => [element("dt", {}, words(fact)), element("dd", {}, factText(fact, value))]);
+}
+
 /** Return a fact's value as text: lists with commas, several dimensions with ×. */
-export function factText(name, value) {
+function factText(name, value) {
   if (Array.isArray(value)) return value.join(name === "resolution" ? " × " : ", ");
   if (value === null || value === undefined) return "–";
   return typeof value === "object" ? JSON.stringify(value) : String(value);
@@ -100,7 +108,7 @@ export function icon(name) {
   const [drawing, use] = ["svg", "use"].map((tag) => document.createElementNS("http://www.w3.org/2000/svg", tag));
   drawing.setAttribute("class", "icon");
   drawing.setAttribute("aria-hidden", "true");
-  use.setAttribute("href", `/static/look/icons.svg#${name}`);
+  use.setAttribute("href", `${ICONS}#${name}`);
   drawing.append(use);
   return drawing;
 }

@@ -2,6 +2,7 @@
 
 import { attempt, hasKey, listing, Refusal, submitJob } from "./api.js";
 import { element } from "./element.js";
+import { once } from "./once.js";
 
 /**
  * Make the forms of a page work.
@@ -17,7 +18,7 @@ export function enableForms(root, subject) {
     form.addEventListener("input", () => present(form));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
-      attempt(() => submit(form));
+      attempt(() => once(form, () => submit(form)));
     });
     for (const chooser of form.querySelectorAll("input[data-fills]")) chooser.addEventListener("change", () => attempt(() => fillFrom(form, chooser)));
     for (const button of form.querySelectorAll("button.copy")) {

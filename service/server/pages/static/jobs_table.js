@@ -2,9 +2,10 @@
 
 import { duration, element, kindTitle, time } from "./element.js";
 
-/** Return what a job is called. */
-export function titleOf(job) {
-  return job.request.name || kindTitle(job.request.kind);
+/** Return what a job is called, with the capture that it is about; `nameOf` gives the name of a capture or environment, or undefined. */
+export function titleOf({ request }, nameOf = () => undefined) {
+  const about = nameOf(request.capture ?? request.intake);
+  return request.name || (about === undefined ? kindTitle(request.kind) : `${kindTitle(request.kind)} · ${about}`);
 }
 
 /** Return how far a job is, in words. */
@@ -19,16 +20,20 @@ export function progressOf(job) {
 /** Jobs in the body of a table, the newest first. */
 export class JobsTable {
   #rows = new Map();
+  #revisions = new Map();
   #body;
   #wanted;
+  #nameOf;
 
   /**
    * @param {HTMLTableElement} table With a head of four columns.
    * @param {function(any): boolean} [wanted] Which jobs are shown.
+   * @param {function(string): string|undefined} [nameOf] As `titleOf` takes it.
    */
-  constructor(table, wanted = () => true) {
+  constructor(table, wanted = () => true, nameOf = undefined) {
     this.#body = table.tBodies[0];
     this.#wanted = wanted;
+    this.#nameOf = nameOf;
   }
 
   /** Return how many jobs are shown. */
@@ -38,9 +43,10 @@ export class JobsTable {
 
   /** Show a job as it is now. */
   put(job) {
-    if (!this.#wanted(job)) return;
+    if (!this.#wanted(job) || job.revision < this.#revisions.get(job.id)) return; // an answer that was overtaken
+    this.#revisions.set(job.id, job.revision);
     const row = element("tr", { "data-created": job.created_at },
-      element("td", {}, element("a", { href: `/jobs/${job.id}` }, titleOf(job)), " ", element("small", {}, job.id)),
+      element("td", {}, element("a", { href: `/jobs/${job.id}` }, titleOf(job, this.#nameOf)), " ", element("small", {}, job.id)),
       element("td", {}, element("span", { class: `state ${job.state}` }, job.state)),
       element("td", {}, ...bar(job), progressOf(job)),
       element("td", {}, time(job.created_at)));

@@ -1,15 +1,13 @@
 /** The time steps of a sequence of captures, of which a page shows one: the address says which (`?step=3`). */
 
-import { read } from "./api.js";
 import { byId, element, show } from "./element.js";
 
 /**
  * Return the number of the time step that is shown, from 1, and let the person choose another; null: the capture is no sequence.
- * @param {string} capture Identifier.
+ * @param {any} facts Of the capture; null: none are known.
  * @param {function(): Promise<string[]>} namesOf Gives the names of the steps, where they are known; asked for a sequence alone.
  */
-export async function chosenStep(capture, namesOf = async () => []) {
-  const { facts } = await read(`/v1/captures/${capture}`);
+export async function chosenStep(facts, namesOf = async () => []) {
   const count = facts?.steps ?? (facts?.captures > 1 ? facts.captures : 0);
   if (count === 0) return null;
   const names = await namesOf();

@@ -10,9 +10,9 @@ import { watch } from "./events.js";
  *   `step` likewise for the time step of a sequence.
  */
 export async function findView(wanted) {
-  for await (const job of listing("/v1/jobs?limit=500&state=succeeded&state=queued&state=running", "jobs")) {
-    const { kind, capture, maps = null, step = null } = job.request;
-    if (kind !== "view" || (wanted.capture ?? capture) !== capture) continue;
+  for await (const job of listing("/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", "jobs")) {
+    const { capture, maps = null, step = null } = job.request;
+    if ((wanted.capture ?? capture) !== capture) continue;
     if ((wanted.maps === undefined || wanted.maps === maps) && (wanted.step === undefined || wanted.step === step)) return job;
   }
   return null;

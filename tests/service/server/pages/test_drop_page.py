@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from tests.scenes.foreign import write_four_phases
-from tests.service.server.pages.conftest import expect
+from tests.service.server.pages.conftest import await_whole, expect
 from tests.service.server.pages.photographs import write_photographs
 
 pytestmark = pytest.mark.long
@@ -97,8 +97,10 @@ def test_a_lost_server_is_told_and_waited_for(server, page, photographs):
         route.abort("connectionreset")
 
     page.route("**/v1/captures/*/guess", lose_the_answer)
-    page.goto("/captures")
+    page.goto("/")
+    await_whole(page)
     page.set_input_files("#folder", photographs)
     page.get_by_text("The server cannot be reached. The upload waits").wait_for(timeout=UPLOAD_MS)
+    page.locator("#close").dispatch_event("click")  # what is under way stays in sight
     page.get_by_role("button", name="Import", exact=True).wait_for(timeout=UPLOAD_MS)
     assert len(captures_named(server, photographs.name)) == 1

@@ -56,8 +56,11 @@ def test_a_page_is_complete_and_its_policy_allows_this_origin_alone(server, path
         assert len(found.identifiers) == len(set(found.identifiers))
         assert set(found.controls) - {"key-value"} <= found.labelled
         for address in found.loads:
-            assert address.startswith("/static/")
-            assert client.get(address).status_code == 200, address
+            assert address.startswith(f"{STATIC}/")
+            loaded = client.get(address)
+            assert loaded.status_code == 200 and "immutable" in loaded.headers["cache-control"], address
+        for address in ("/static/api.js", "/static/v-of-yesterday/api.js"):  # as a page of another version asks
+            assert client.get(address).headers["cache-control"] == "no-cache"
     headers = answer.headers
     policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
     assert policy["default-src"] == "'none'" and policy["frame-ancestors"] == "'none'" and policy["base-uri"] == "'none'"

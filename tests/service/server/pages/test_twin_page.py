@@ -47,6 +47,10 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         # the colours of the pages are there
         page.wait_for_function("() => getComputedStyle(document.body).getPropertyValue('--paper') !== ''")
         keep(page, "twin", tmp_path)
+        page.route("**/state.json", lambda route: route.abort())
+        page.locator("#state", has_text="The twin does not answer").wait_for()
+        page.unroute_all()
+        page.locator("#state", has_text="frames received").wait_for()  # one that answers again has not ended
         stop.set()
         player.join()
         page.locator("#dome title", has_text=f"lamp {brightest}: 0.0 %, 0.0 %, 0.0 %").wait_for(state="attached")

@@ -14,13 +14,15 @@ function pageOf({ id, state }) {
   return state === "ready" ? `/object/${id}` : `/captures/${id}`;
 }
 
-/** Yield the items of a list of the API, page by page. */
-export async function* itemsOf(list) {
+/** Return the items of a list of the API. */
+export async function itemsOf(list) {
+  const found = [];
   if (list === "assets") {
-    for await (const job of listing("/v1/jobs?limit=500&state=succeeded&kind=export&kind=pipeline", "jobs")) yield assetItem(job);
+    for await (const job of listing("/v1/jobs?limit=500&state=succeeded&kind=export&kind=pipeline", "jobs")) found.push(assetItem(job));
   } else {
-    for await (const intake of listing(`/v1/${list}?limit=500`, "items")) yield intakeItem(list, intake);
+    for await (const intake of listing(`/v1/${list}?limit=500`, "items")) found.push(intakeItem(list, intake));
   }
+  return found;
 }
 
 /** Return the item of a capture or an environment. */

@@ -2,7 +2,6 @@
 
 import { listing, read } from "../api.js";
 import { watch } from "../events.js";
-import { kindTitle } from "../element.js";
 
 const MOST_FAILED = 10;
 
@@ -28,23 +27,27 @@ export class Jobs {
 
   /** Know a job that was submitted, before the server tells of it. */
   take(job) {
-    this.#jobs.set(job.id, job);
+    this.#know(job);
     this.#changed(job);
   }
 
+  /** Keep a job as it is now, unless a later answer has come before. */
+  #know(job) {
+    if (!(job.revision < this.#jobs.get(job.id)?.revision)) this.#jobs.set(job.id, job);
+  }
+
   async load() {
-    for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#jobs.set(job.id, job);
-    const { jobs } = await read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`);
-    for (const job of jobs) this.#jobs.set(job.id, job);
+    const failed = read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`).then(({ jobs }) => jobs.forEach((job) => this.#know(job)));
+    const active = async () => { for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#know(job); };
+    await Promise.all([failed, active()]);
     await this.#askWhatIsWrong();
-    this.#changed(null);
   }
 
   follow() {
     return watch("/v1/events", {
       job: async (job) => {
         const isNew = this.#jobs.get(job.id)?.state !== job.state;
-        this.#jobs.set(job.id, job);
+        this.#know(job);
         if (isNew && job.state === "queued") await this.#askWhatIsWrong();
         this.#changed(job);
       },
@@ -57,10 +60,4 @@ export class Jobs {
     const answer = await fetch("/readyz");
     this.fault = answer.ok ? "" : (await answer.json()).detail;
   }
-}
-
-/** Return what a job is called, with the capture that it is about; `nameOf` gives the name of a capture or environment, or undefined. */
-export function titleOf({ request }, nameOf) {
-  const about = nameOf(request.capture ?? request.intake);
-  return request.name || (about === undefined ? kindTitle(request.kind) : `${kindTitle(request.kind)} · ${about}`);
 }

@@ -1,12 +1,14 @@
 /** The home page: all captures, sequences, assets and environments as cards, and the jobs above them. */
 
 import { attempt, load, newToken, postOnce, read, Refusal, send } from "../api.js";
-import { mountDropZone } from "../upload/drop_zone.js";
+import { isUnderWay, mountDropZone } from "../upload/drop_zone.js";
 import { byId, setChildren, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
+import { titleOf } from "../jobs_table.js";
+import { newest } from "../once.js";
 import { cardOf, setPicture } from "./card.js";
 import { assetItem, chosen, intakeItem, itemsOf } from "./items.js";
-import { Jobs, titleOf } from "./jobs.js";
+import { Jobs } from "./jobs.js";
 import { environmentPicture, pictureOf } from "./picture.js";
 import { showStrip } from "./strip.js";
 
@@ -14,6 +16,7 @@ const LISTS = ["captures", "environments", "assets"];
 const PAGE = 60; // cards that are added at once
 const items = new Map();
 const cards = new Map(); // of the items that have been shown
+const refreshed = {}; // by the name of a list or the identifier of what was asked for again
 const asked = new Set(); // captures whose view this page has asked for
 let most = PAGE;
 let isLoaded = false;
@@ -55,7 +58,13 @@ function makeCard(item) {
 }
 
 function openDropZone() {
-  show(byId("adding"), true);
+  show(byId("drop"), true);
+}
+
+/** Close the panel. What is still sent, or waits for a choice, stays in sight. */
+function closeDropZone() {
+  show(byId("drop"), false);
+  for (const line of [...byId("uploads").children]) if (!isUnderWay(line)) line.remove();
 }
 
 /** Take an item as it is now. */
@@ -124,8 +133,10 @@ async function changed(job) {
 
 async function refresh(id) {
   const list = id.startsWith("env_") ? "environments" : "captures";
+  const isNewest = (refreshed[id] ??= newest())();
   try {
-    put(intakeItem(list, await read(`/v1/${list}/${id}`)));
+    const found = await read(`/v1/${list}/${id}`);
+    if (isNewest()) put(intakeItem(list, found));
   } catch (error) {
     if (error.status !== 404) throw error;
     items.delete(id);
@@ -153,7 +164,10 @@ async function showProject() {
 }
 
 async function fill(list) {
-  for await (const item of itemsOf(list)) put(item);
+  const isNewest = (refreshed[list] ??= newest())();
+  const found = await itemsOf(list);
+  if (!isNewest()) return;
+  found.forEach(put);
   draw();
 }
 
@@ -170,19 +184,20 @@ byId("add").addEventListener("click", () => {
   openDropZone();
   byId("folder").click(); // what most people want; the panel stays for the rest
 });
-byId("close").addEventListener("click", () => { show(byId("adding"), false); byId("add").focus(); });
+byId("close").addEventListener("click", () => { closeDropZone(); byId("add").focus(); });
 addEventListener("dragenter", () => { openDropZone(); document.body.classList.add("dragging"); });
 for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
 addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));
 byId("sample").addEventListener("click", () => attempt(openSample));
 mountDropZone(fill);
+closeDropZone();
 
 attempt(showProject); // the cards do not wait for it
 await load(async () => {
-  await fill("captures");
-  await Promise.all([...LISTS.slice(1).map(fill), jobs.load()]);
+  const [lists] = await Promise.all([Promise.all(LISTS.map(itemsOf)), jobs.load()]);
+  lists.flat().forEach(put); // captures first, whose pictures and names assets have
   isLoaded = true;
   draw();
-  prepareNext();
+  changed(null);
 });
 await attempt(() => jobs.follow());

@@ -12,7 +12,8 @@
     const present = () => {
       button.setAttribute("aria-label", isDark() ? "Show in light" : "Show in dark");
       button.title = button.getAttribute("aria-label");
-      button.querySelector("use").setAttribute("href", `/static/look/icons.svg#${isDark() ? "sun" : "moon"}`);
+      const use = button.querySelector("use");
+      use.setAttribute("href", use.getAttribute("href").replace(/#.*/, isDark() ? "#sun" : "#moon"));
     };
     button.addEventListener("click", () => {
       root.dataset.theme = isDark() ? "light" : "dark";

@@ -2,6 +2,7 @@
 
 import { attempt, post, read, remove } from "../api.js";
 import { element, show } from "../element.js";
+import { newest, once } from "../once.js";
 import { mountNotes } from "../publish/overlay.js";
 
 const DRAG_PX = 5; // a pointer that moves less marks a point
@@ -32,6 +33,7 @@ export async function mountAnnotations(parent, capture, picture) {
   const marking = element("div", { class: "marking", tabindex: 0, role: "button", "aria-label": HELP, title: HELP, hidden: true });
   const area = element("div", { class: "area", hidden: true });
   marking.append(area);
+  const asked = newest();
   let place = null; // of the note that is written
   picture.tools.append(add);
   picture.notes.after(marking);
@@ -88,15 +90,17 @@ export async function mountAnnotations(parent, capture, picture) {
   });
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    attempt(async () => {
+    attempt(() => once(form, async () => {
       await post(path, { body: { type: "TextualBody", value: words.value }, target: { selector: place } });
       end();
       await present();
-    });
+    }));
   });
 
   async function present() {
+    const isNewest = asked();
     const notes = (await read(path)).items.map((each) => noteOf(each, picture.step));
+    if (!isNewest()) return;
     picture.notes.replaceChildren();
     list.querySelector("ol").replaceChildren();
     picture.onplace(mountNotes(picture.notes, list, notes, ({ x, y, width, height }) => picture.show({

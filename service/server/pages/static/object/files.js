@@ -2,9 +2,11 @@
 
 import { attempt, listing, resultsOf, save } from "../api.js";
 import { bytes, element, kindTitle } from "../element.js";
+import { newest } from "../once.js";
 import { reportWords } from "./report.js";
 import { requestRows } from "./request.js";
 
+const asked = newest();
 const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json|annotations\.json|basis\.(exr|ptm|rti)|separation\.exr)$/;
 
 /** Return the newest file of each name that jobs, the newest first, have made: name, job and result of each. */
@@ -36,9 +38,10 @@ export function presentReport(details, files) {
   details.querySelector("div").replaceChildren();
   if (file === undefined) return;
   const { job, result } = file;
+  const isNewest = asked();
   const open = () => details.open && attempt(async () => {
     const [report, { chosen, usual }] = await Promise.all([resultsOf(job.id).json(result.name), requestRows(job)]);
-    details.querySelector("div").replaceChildren(element("h3", {}, kindTitle(job.request.kind)), element("dl", {}, ...chosen),
+    if (isNewest()) details.querySelector("div").replaceChildren(element("h3", {}, kindTitle(job.request.kind)), element("dl", {}, ...chosen),
       element("details", {}, element("summary", {}, "All else is as it is by default"), element("dl", {}, ...usual)), ...reportWords(report));
   });
   details.ontoggle = open;

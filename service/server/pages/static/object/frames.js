@@ -1,7 +1,8 @@
 /** Relit frames of an object: a player over small pictures that the server makes of them, a filmstrip, a video, and the files. */
 
 import { attempt, fetched, listing, Refusal } from "../api.js";
-import { bytes, element } from "../element.js";
+import { bytes, element, icon } from "../element.js";
+import { newest, once } from "../once.js";
 import { savingLink } from "./files.js";
 import { offerVideo } from "./video.js";
 
@@ -17,18 +18,18 @@ const STRIP_PX = 72; // height of the pictures of the filmstrip
  */
 export async function mountFrames(parent, jobs, nameOf) {
   const chosen = element("select", {}, ...jobs.map((job) => element("option", { value: job.id }, nameOf(job))));
-  const place = element("div");
-  const again = () => attempt(() => player(place, chosen.value, (job) => job === chosen.value));
+  const [place, asked] = [element("div"), newest()];
+  const again = () => attempt(() => player(place, chosen.value, asked()));
   chosen.addEventListener("change", again);
   parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Frames of ", chosen)), place);
   await again();
 }
 
-/** Show the frames of a job, and load their pictures for as long as these frames are shown; `isChosen` says whether a job still is. */
+/** Show the frames of a job, and load their pictures for as long as these frames are shown; `isChosen` says whether they still are to be. */
 async function player(place, job, isChosen) {
   const frames = [];
   for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
-  if (!isChosen(job)) return;
+  if (!isChosen()) return;
   if (frames.length === 0) throw new Error("this job has no frames any more");
   const canvas = element("canvas", { class: "frames-picture", role: "img", "aria-label": "A relit frame" });
   const slider = element("input", { type: "range", min: 0, max: frames.length - 1, step: 1, value: 0, "aria-label": "Frame" });
@@ -40,34 +41,39 @@ async function player(place, job, isChosen) {
   const faults = new Map(); // why frames have no picture, by their place
   let [at, playing, isDrawing, drawing] = [0, null, false, null];
 
-  /** Show a frame; while one is decoded, only the last that was asked for waits. Ends when it is drawn. */
+  /** Show a frame; while one is decoded, only the last that was asked for waits. Ends when it is shown. */
   function show(index) {
     strip.children[at].firstChild.setAttribute("aria-pressed", "false");
     strip.children[index].firstChild.setAttribute("aria-pressed", "true");
     at = index;
     slider.value = String(index);
     say();
-    if (!isDrawing) drawing = drawLast();
+    drawing = isDrawing ? drawing : drawLast();
     return drawing;
   }
 
   async function drawLast() {
     isDrawing = true;
-    let drawn = null;
-    try {
-      while (drawn !== at && pictures[at] !== undefined) {
-        drawn = at;
-        const picture = await createImageBitmap(pictures[at]);
+    for (let drawn = null; drawn !== at;) {
+      drawn = at;
+      if (pictures[drawn] === undefined) continue;
+      try {
+        const picture = await createImageBitmap(pictures[drawn]);
         draw(picture);
         picture.close();
+      } catch {
+        miss(drawn, UNREADABLE);
       }
-    } catch {
-      pictures[drawn] = undefined;
-      faults.set(drawn, UNREADABLE);
-      say();
-    } finally {
-      isDrawing = false;
     }
+    isDrawing = false;
+  }
+
+  /** Say that a frame has no picture, in the filmstrip and, where it is shown, in place of the picture. */
+  function miss(index, why) {
+    pictures[index] = undefined;
+    faults.set(index, why);
+    strip.children[index].firstChild.replaceChildren(icon("warning"));
+    say();
   }
 
   /** Say which frame is shown, and why it has no picture, with a button that asks for those that did not come. */
@@ -75,6 +81,7 @@ async function player(place, job, isChosen) {
     const fault = faults.get(at);
     const why = fault !== undefined ? ` has no picture. ${fault}` : pictures[at] === undefined ? ", its picture is being made" : "";
     told.textContent = `${frames[at].name} (${at + 1} of ${frames.length})${why}`;
+    canvas.classList.toggle("missing", fault !== undefined); // else it would show the frame before
     again.hidden = faults.size === 0;
     again.textContent = faults.size === 1 ? "Try the missing picture again" : `Try ${faults.size} missing pictures again`;
   }
@@ -115,7 +122,7 @@ async function player(place, job, isChosen) {
       drawSmall(index, await createImageBitmap(taken));
       pictures[index] = taken;
     } catch (error) {
-      faults.set(index, error instanceof Refusal ? error.message : UNREADABLE);
+      miss(index, error instanceof Refusal ? error.message : UNREADABLE);
     }
     if (index === at) await show(index);
     else say();
@@ -135,9 +142,11 @@ async function player(place, job, isChosen) {
     onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
   place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told), element("p", { class: "actions" }, again)), tools, strip, files);
   const waiting = frames.map((_, index) => index);
-  const load = async () => { for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next); };
+  const loaders = Array.from({ length: PARALLEL }, () => async () => {
+    for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next);
+  });
   const loadAll = () => attempt(async () => {
-    await Promise.all(Array.from({ length: PARALLEL }, load));
+    await Promise.all(loaders.map((load) => once(load, load))); // those that are at work take what waits
     if (!canvas.isConnected || canvas.dataset.ready !== undefined || frames.some((_, index) => pictures[index] === undefined)) return;
     if (frames.length > 1) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => {
       stopPlaying();

@@ -2,6 +2,7 @@
 
 import { attempt, listing, read, submitJob } from "../api.js";
 import { element, show } from "../element.js";
+import { once } from "../once.js";
 
 /** Return the newest depth of each other capture, with the name of the capture. */
 async function otherDepths(identifier) {
@@ -41,10 +42,10 @@ export async function offerFusion(box, identifier, jobs, submitted) {
     const depths = [depth.id, ...[...form.querySelectorAll(":checked")].map(({ value }) => value)];
     fault.textContent = "Choose at least one other scan.";
     show(fault, depths.length < 2);
-    if (depths.length >= 2) attempt(async () => submitted(await submitJob({ kind: "register", depths })));
+    if (depths.length >= 2) attempt(() => once(form, async () => submitted(await submitJob({ kind: "register", depths }))));
   } }, element("p", { class: "help" }, "Choose scans of the same object from other places. Their poses are found first; then one mesh is fused of all."),
   element("ul", { class: "plain" }, ...choices), element("p", { class: "actions" }, element("button", { type: "submit", class: "quiet" }, "Find the poses"),
-    registered === undefined || isFused ? null : element("button", { type: "button", onclick: () => attempt(async () => submitted(await submitJob({ kind: "fuse", registered: registered.id }))) },
+    registered === undefined || isFused ? null : element("button", { type: "button", onclick: () => attempt(() => once(form, async () => submitted(await submitJob({ kind: "fuse", registered: registered.id })))) },
       "Fuse the registered scans")), fault);
   box.replaceChildren(element("summary", {}, "Fuse with other scans"), form);
   box.open ||= registered !== undefined && !isFused;

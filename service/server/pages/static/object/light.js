@@ -2,8 +2,9 @@
 
 import { attempt, submitJob } from "../api.js";
 import { element } from "../element.js";
-import { loadEnvironment, readyEnvironments } from "../environments.js";
+import { loadEnvironment } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
+import { once } from "../once.js";
 import { mount } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
 import { mountVideo } from "./video.js";
@@ -16,9 +17,10 @@ const FOUND = "The lights of this picture are those that the solve has found. Fr
  * @param {HTMLElement} parent Takes it.
  * @param {string} capture Identifier.
  * @param {import("../view/view_file.js").ViewFile} view Of it.
+ * @param {{id: string, name: string}[]} environments Of the server.
  * @param {{canRender?: boolean}} [options] Whether the batch can render it: the lights are those of the capture, and not of a solve alone.
  */
-export async function mountLight(parent, capture, view, { canRender = true } = {}) {
+export async function mountLight(parent, capture, view, environments, { canRender = true } = {}) {
   const batch = {
     last: element("input", { type: "text", inputmode: "numeric", value: "24", size: 5, autocomplete: "off" }),
     spin: element("input", { type: "text", inputmode: "decimal", value: "360", size: 6, autocomplete: "off" }),
@@ -66,8 +68,7 @@ export async function mountLight(parent, capture, view, { canRender = true } = {
     }
   }
 
-  async function submit(event) {
-    event.preventDefault();
+  async function submit() {
     present();
     if (!batch.fault.hidden) return;
     const job = await submitJob(request());
@@ -77,7 +78,7 @@ export async function mountLight(parent, capture, view, { canRender = true } = {
   function batchForm() {
     for (const each of [batch.last, batch.spin]) each.addEventListener("input", present);
     return element("section", { "aria-label": "Frames" }, element("h2", {}, "Render these frames"),
-      element("form", { novalidate: true, onsubmit: (event) => attempt(() => submit(event)) },
+      element("form", { novalidate: true, onsubmit: (event) => { event.preventDefault(); attempt(() => once(event.target, submit)); } },
         element("p", { class: "actions" }, element("label", {}, "Frames ", batch.last), element("label", {}, "Spin of the environment (degrees) ", batch.spin),
           element("button", { type: "submit" }, "Render")), batch.fault,
         element("details", { class: "same-as" }, element("summary", {}, "The same as a command"), batch.command, element("p", {}, "with this keys.json:"), batch.keys,
@@ -85,7 +86,6 @@ export async function mountLight(parent, capture, view, { canRender = true } = {
   }
 
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
-  const environments = await readyEnvironments();
   const [stage, notes] = [element("div"), element("div")];
   parent.replaceChildren(stage, notes, canRender ? batchForm() : element("p", { class: "help" }, FOUND));
   const viewer = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });

@@ -1,7 +1,7 @@
 /** The modes of an object: what there is to show of it, and how each is shown. */
 
 import { attempt } from "../api.js";
-import { element } from "../element.js";
+import { element, kindTitle } from "../element.js";
 import { mountAsset } from "./asset.js";
 import { mountFrames } from "./frames.js";
 import { mountLight } from "./light.js";
@@ -16,18 +16,19 @@ const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
  * @param {string} identifier Of the capture. @param {import("../view/view_file.js").ViewFile} view Of it. @param {number|null} step Of a sequence.
  * @param {any[]} jobs Of the object, the newest first.
  * @param {any} facts Of the capture.
+ * @param {any[]} environments Of the server.
  */
-export function modesOf(identifier, view, step, jobs, facts) {
+export function modesOf(identifier, view, step, jobs, facts, environments) {
   const of = (kinds) => jobs.filter((job) => kinds.includes(job.request.kind));
   const [solved, measured, exported] = [of(MAPS), of(["depth"]), of(["export", "pipeline"])];
   const relit = jobs.filter(({ request: { kind, environment, keys } }) => kind === "relight" || (kind === "pipeline" && Boolean(environment ?? keys)));
   const modes = {};
   const ofJob = (title, [job], mount) => (job === undefined ? undefined : { title, job: job.id, mount });
   const maps = (job) => async (parent) => mountResults(parent, await viewOf(job.id, parent));
-  if (view.info.relight !== null && step === null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view) };
+  if (view.info.relight !== null && step === null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view, environments) };
   else if (hasUnknownLights(facts) && step === null) { // they are those that a solve has found
     const found = solved.filter(({ request: { options, solve } }) => (options ?? solve)?.lights === "unknown");
-    modes.light = ofJob("Light", found, async (parent) => mountLight(parent, identifier, await viewOf(found[0].id, parent), { canRender: false }));
+    modes.light = ofJob("Light", found, async (parent) => mountLight(parent, identifier, await viewOf(found[0].id, parent), environments, { canRender: false }));
   }
   modes.maps = ofJob("Maps", solved, maps(solved[0]));
   modes["3d"] = ofJob("3-D", exported, (parent) => mountAsset(parent, exported[0]));
@@ -42,7 +43,7 @@ export function modesOf(identifier, view, step, jobs, facts) {
 
 /** Return what a job is called beside others of the object. */
 function nameOf(job) {
-  return `${job.request.name || job.request.options?.method || job.request.kind} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
+  return `${job.request.name || job.request.options?.method || kindTitle(job.request.kind)} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
 }
 
 async function mountPhotographed(parent, view) {

@@ -2,6 +2,7 @@
 
 import { attempt, submitJob } from "../api.js";
 import { element, show } from "../element.js";
+import { once } from "../once.js";
 
 const MOST_STEPS = 2; // beside lighting it
 const OPTIONS_OF_SOLVE = { pipeline: "solve", solve: "options" }; // where the request of a kind has the options of the solve
@@ -40,10 +41,7 @@ export function offerSteps(box, facts, identifier, done, submitted) {
   const buttons = all.filter(({ dataset }) => heldBy(facts).includes(dataset.holds) && !done.includes(dataset.kind)).slice(0, MOST_STEPS);
   for (const button of all) {
     show(button, buttons.includes(button));
-    button.onclick = () => attempt(async () => {
-      button.disabled = true;
-      await submitted(await submitJob(requestOf(button.dataset.kind, identifier, facts)).finally(() => { button.disabled = false; }));
-    });
+    button.onclick = () => attempt(() => once(button, async () => submitted(await submitJob(requestOf(button.dataset.kind, identifier, facts)))));
   }
   box.querySelector(".granted")?.remove();
   if (hasUnknownLights(facts) && buttons.some(({ dataset }) => dataset.kind in OPTIONS_OF_SOLVE)) box.append(element("small", { class: "granted" }, FOUND));

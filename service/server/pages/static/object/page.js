@@ -1,8 +1,10 @@
 /** The page of one object: what was captured and what was made of it, as modes of one view. Its address says which is shown, and how. */
 
 import { attempt, listing, load, read } from "../api.js";
-import { byId, element, factText, show, words } from "../element.js";
+import { byId, element, factRows, show } from "../element.js";
+import { readyEnvironments } from "../environments.js";
 import { Address, writeNow } from "../publish/address.js";
+import { newest } from "../once.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
@@ -100,24 +102,27 @@ async function present(jobs, facts, work) {
 }
 
 await load(async () => {
-  const capture = await read(`/v1/captures/${identifier}`);
+  const [capture, jobs, environments] = await Promise.all([read(`/v1/captures/${identifier}`), jobsOfObject(), readyEnvironments()]);
   byId("name").textContent = capture.name;
   document.title = `${capture.name} · Relit`;
-  byId("facts").replaceChildren(...Object.entries(capture.facts ?? {}).flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
+  byId("facts").replaceChildren(...factRows(capture.facts ?? {}));
   byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, capture.name, "/captures"));
   if (capture.state !== "ready") {
     byId("view").replaceChildren(element("p", {}, `${capture.problem ?? `This capture is ${capture.state}.`} `, element("a", { href: `/captures/${identifier}` }, "Its page says more.")));
     return;
   }
-  const step = await chosenStep(identifier);
-  const [view, jobs] = await Promise.all([openView(identifier, null, step, byId("view")).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
+  const step = await chosenStep(capture.facts);
+  const view = await ViewFile.open((await openView(identifier, null, step, byId("view"))).files);
   const facts = litFacts(capture.facts ?? {}, view);
+  const asked = newest();
   const work = new Work(byId("work"), async () => {
+    const isNewest = asked();
     const now = await jobsOfObject();
-    takeModes(modesOf(identifier, view, step, now, facts));
+    if (!isNewest()) return; // another job has ended meanwhile, and its look sees both
+    takeModes(modesOf(identifier, view, step, now, facts, environments));
     await present(now, facts, work);
   });
-  takeModes(modesOf(identifier, view, step, jobs, facts));
+  takeModes(modesOf(identifier, view, step, jobs, facts, environments));
   const wanted = { mode: "" };
   address.read(wanted);
   const first = wanted.mode in modes ? wanted.mode : Object.keys(modes)[0];

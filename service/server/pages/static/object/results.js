@@ -16,7 +16,8 @@ export async function viewOf(job, place) {
   const found = await read(`/v1/jobs/${job}`);
   const capture = await captureOf(found);
   const { crop = null } = found.request.options ?? {}; // maps of a part are shown with that part
-  return ViewFile.open((await openView(capture, job, await chosenStep(capture, () => stepNames(job)), place, crop === null ? {} : { options: { crop } })).files);
+  const { facts } = await read(`/v1/captures/${capture}`);
+  return ViewFile.open((await openView(capture, job, await chosenStep(facts, () => stepNames(job)), place, crop === null ? {} : { options: { crop } })).files);
 }
 
 /** Show a view of maps; `others` to compare with, as the viewer of maps takes them. */

@@ -2,6 +2,7 @@
 
 import { attempt, listing, post, read } from "../api.js";
 import { element, kindTitle } from "../element.js";
+import { once } from "../once.js";
 import { watch } from "../events.js";
 import { progressOf } from "../jobs_table.js";
 
@@ -27,7 +28,7 @@ export class Work {
   /** Show a job until it has succeeded; one that fails stays, with its reason. */
   follow(job) {
     const [bar, words] = [element("progress", { "aria-label": `Progress of ${kindTitle(job.request.kind)}` }), element("span", { role: "status" })];
-    const button = element("button", { type: "button", class: "quiet", onclick: () => attempt(() => this.#act(job.id)) });
+    const button = element("button", { type: "button", class: "quiet", onclick: () => attempt(() => once(line, () => this.#act(job.id))) });
     const line = element("li", { "data-job": job.id }, element("strong", {}, kindTitle(job.request.kind)), bar, button, element("a", { href: `/jobs/${job.id}` }, "Details"), words);
     this.#lines.set(job.id, { line, bar, words, button, state: "" });
     this.#box.append(line);
@@ -50,8 +51,9 @@ export class Work {
 
   #present(job) {
     const shown = this.#lines.get(job.id);
-    if (shown === undefined || shown.state === "succeeded") return;
+    if (shown === undefined || shown.state === "succeeded" || job.revision < shown.revision) return; // an answer that was overtaken
     const { line, bar, words, button } = shown;
+    shown.revision = job.revision;
     shown.state = line.className = job.state;
     words.textContent = job.state === "queued" ? "waits for a free worker" : progressOf(job) || job.state;
     if (job.state === "running" && job.progress?.total > 0) Object.assign(bar, { max: job.progress.total, value: job.progress.done });

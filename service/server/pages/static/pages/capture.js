@@ -1,7 +1,7 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
 import { attempt, listing, load, read } from "../api.js";
-import { byId, element, factText, show, words } from "../element.js";
+import { byId, element, factRows, show } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
 import { JobsTable } from "../jobs_table.js";
@@ -47,12 +47,10 @@ async function ask(capture) {
 function present(capture) {
   document.title = `${capture.name} · Relit`;
   byId("name").textContent = capture.name;
-  const { proposal, ...known } = capture.facts ?? {};
-  const missing = proposal === undefined ? "Not all files are here yet: drop its folder on the page of captures to continue." : "Its files are here: say how they are imported.";
+  const missing = capture.facts?.proposal === undefined ? "Not all files are here yet: drop its folder on the page of captures to continue." : "Its files are here: say how they are imported.";
   byId("state").textContent = capture.problem ?? (capture.state === "receiving" ? missing : capture.state);
   byId("state").classList.toggle("fault", capture.problem !== null);
-  const facts = Object.entries({ identifier: capture.id, ...(capture.registered ? { place: "a folder of the server" } : {}), ...known });
-  byId("facts").replaceChildren(...facts.flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
+  byId("facts").replaceChildren(...factRows({ identifier: capture.id, ...(capture.registered ? { place: "a folder of the server" } : {}), ...capture.facts }));
 }
 
 /** Show what can be done with a capture that holds this: what it is made for as buttons, the same with options, and the rest behind More. */
@@ -85,7 +83,7 @@ function toObject() {
 }
 
 async function look(facts) {
-  const step = await chosenStep(identifier);
+  const step = await chosenStep(facts);
   const { files } = await openView(identifier, null, step, byId("preparing"));
   const view = await ViewFile.open(files);
   if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier, [], toObject);

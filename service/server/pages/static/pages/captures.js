@@ -3,9 +3,13 @@
 import { listing, load } from "../api.js";
 import { askHowToImport, mountDropZone } from "../upload/drop_zone.js";
 import { byId, element, time } from "../element.js";
+import { newest } from "../once.js";
+
+const asked = { captures: newest(), environments: newest() };
 
 /** Return what fills a list, when all of it is here. */
 async function list(what) {
+  const isNewest = asked[what]();
   const body = byId(what).tBodies[0];
   const rows = [];
   for await (const item of listing(`/v1/${what}`, "items")) {
@@ -14,7 +18,7 @@ async function list(what) {
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
       element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
   }
-  return () => body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
+  return () => isNewest() && body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
 }
 
 /** Return the button that asks how files are imported that were looked at, perhaps in another tab; null where there is nothing to ask. */

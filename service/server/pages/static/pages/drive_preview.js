@@ -110,11 +110,12 @@ export async function mountObject(parent, view, directions, frames, space) {
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const { quadrature } = relight;
   const [inverse, beyond, outside, captured, index, matte] = await Promise.all(
-    [quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index, relight.matte].map((block) => view.block(block)));
+    view.blocks([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index, relight.matte]));
   const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
   const canvas = element("canvas", { class: "picture", width: relight.cols, height: relight.rows, role: "img", "aria-label": `${view.info.name} under the lamps` });
   const stops = element("input", { type: "range", min: -10, max: 10, step: 0.1, value: 0, "aria-label": "Exposure of the object in stops" });
-  const renderer = new BasisRenderer(canvas, relight, view.info.color_space, new Uint16Array(index));
+  const renderer = new BasisRenderer(canvas, relight, view.info.color_space);
+  renderer.setTiles(new Uint16Array(index));
   renderer.setMatte(new Uint8Array(matte));
   for (const [term, block] of relight.basis.entries()) await renderer.setTerm(term, new Uint16Array(await view.block(block)));
   const matrix = matrixBetween(space, view.info.color_space);

@@ -7,6 +7,7 @@ import { enableForms } from "../form.js";
 import { titleOf } from "../jobs_table.js";
 import { setPrimary } from "../object/next_steps.js";
 import { removeLater } from "../object/removal.js";
+import { newest, once } from "../once.js";
 import { requestRows } from "../object/request.js";
 import { reloadWhenBack } from "../repeat.js";
 
@@ -14,9 +15,13 @@ const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
 const SEQUENCE = "sequence.json";
+const asked = newest();
 let logged = "";
+let shown = null; // the job as it was told last
 
 function present(job) {
+  if (job.revision < shown?.revision) return; // an answer that was overtaken
+  shown = job;
   document.title = `${titleOf(job)} · Relit`;
   byId("name").textContent = titleOf(job);
   byId("state").replaceChildren(element("span", { class: `state ${job.state}` }, job.state), job.attempt > 1 ? ` attempt ${job.attempt}` : "");
@@ -52,8 +57,9 @@ async function presentRequest(job) {
 }
 
 async function log() {
+  const isNewest = asked();
   const { entries } = await read(`/v1/jobs/${identifier}/log`);
-  byId("log").replaceChildren(...entries.map((entry) => element("li", {}, time(entry.at), ` attempt ${entry.attempt}: ${entry.text}`)));
+  if (isNewest()) byId("log").replaceChildren(...entries.map((entry) => element("li", {}, time(entry.at), ` attempt ${entry.attempt}: ${entry.text}`)));
 }
 
 async function presentResults(job) {
@@ -122,10 +128,10 @@ async function ended() {
 }
 
 for (const [id, action] of Object.entries({ cancel: "cancel", retry: "retry", resume: "resume" })) {
-  byId(id).addEventListener("click", () => attempt(async () => {
+  byId(id).addEventListener("click", () => attempt(() => once(byId(id), async () => {
     present(await post(`/v1/jobs/${identifier}/${action}`));
     if (action !== "cancel") await follow();
-  }));
+  })));
 }
 byId("delete").addEventListener("click", () => removeLater(`/v1/jobs/${identifier}`, byId("name").textContent, "/jobs"));
 await load(follow);

@@ -2,6 +2,7 @@
 
 import { attempt, load, post, read, Refusal } from "../api.js";
 import { byId, bytes, element, icon, setChildren, show, time, words } from "../element.js";
+import { newest, once } from "../once.js";
 import { progressOf, titleOf } from "../jobs_table.js";
 
 const REFRESH_MS = 5000;
@@ -9,10 +10,13 @@ const ERRORS = 10;
 const QUESTIONS = { drain: "Let this worker finish its step, give its job back and end?", kill: "Kill this worker at once? Its step is lost; another worker goes on with the job." };
 const PAGES = { cap: "captures", job: "jobs" }; // of identifiers
 const shown = new Map(); // of each worker, the line that it has and what that says
+const asked = newest();
 let next = null; // page of the audit log
 
 async function look() {
+  const isNewest = asked();
   const [machines, { jobs: failed }] = await Promise.all([read("/v1/machines"), read(`/v1/jobs?state=failed&limit=${ERRORS}`)]);
+  if (!isNewest()) return;
   show(byId("view"), true);
   byId("faults").replaceChildren(...machines.faults.map((fault) => element("li", {}, fault)));
   setChildren(byId("workers"), lines(machines.workers.map(lineOf), "No worker was seen lately."));
@@ -64,6 +68,7 @@ async function audit() {
   const page = await read(next === null ? "/v1/audit?limit=50" : `/v1/audit?limit=50&before=${next}`);
   byId("audit").tBodies[0].append(...page.entries.map((entry) => element("tr", {}, element("td", {}, time(entry.at)), element("td", {}, entry.actor),
     element("td", {}, words(entry.action).replace(".", ": ")), element("td", {}, objectLink(entry.object)), element("td", {}, entry.request ?? "command line"))));
+  if (page.entries.length === 0 && next === null) byId("audit").tBodies[0].append(element("tr", {}, element("td", { colspan: 5 }, "Nobody has changed anything yet.")));
   next = page.next;
   show(byId("more"), next !== null);
 }
@@ -73,16 +78,15 @@ function objectLink(name) {
   return page === undefined ? name : element("a", { href: `/${page}/${name}` }, name);
 }
 
-byId("more").addEventListener("click", () => attempt(audit));
+byId("more").addEventListener("click", () => attempt(() => once(byId("more"), audit)));
 await load(async () => {
   try {
-    await look();
+    await Promise.all([look(), audit()]);
   } catch (error) {
     if (!(error instanceof Refusal) || error.status !== 403) throw error;
     byId("refused").textContent = `This page is for operators: ${error.message}. Give a key of that scope with the button Key above.`;
     show(byId("refused"), true);
     return;
   }
-  await audit();
   setInterval(() => document.visibilityState === "visible" && attempt(look), REFRESH_MS);
 });

@@ -5,7 +5,7 @@ import { DoubleSide, MeshBasicMaterial, MeshNormalMaterial, MeshStandardMaterial
 const CLAY = 0xb9b0a6;
 
 /** Words of each way. */
-export const SURFACES = { asset: "As its materials say", clay: "Clay", wires: "Wires", normals: "Normals", albedo: "Albedo", roughness: "Roughness", metalness: "Metalness" };
+export const SURFACES = { asset: "Its materials", clay: "Clay", wires: "Wires", normals: "Normals", albedo: "Albedo", roughness: "Roughness", metalness: "Metalness" };
 
 const MADE = {
   clay: () => new MeshStandardMaterial({ color: CLAY, roughness: 0.85, side: DoubleSide }),

@@ -1,13 +1,15 @@
 /** The form of a capture: its name, its plan, and what is started with them. */
 
 import { attempt, post } from "../api.js";
-import { byId, element } from "../element.js";
+import { byId, element, show } from "../element.js";
+import { once } from "../once.js";
 
 const name = byId("name");
 const plan = byId("plan");
 const exposures = byId("exposures");
 const tracking = byId("tracking");
 const lights = byId("lights");
+const edited = new Set(); // fields that a person has changed since the server was asked for something: what it tells leaves them alone
 let lamps = [];
 let notify = () => {};
 
@@ -33,18 +35,19 @@ export function chosenLamps() {
 /** Take a lamp among those that are lit one by one, or leave it out. */
 export function toggleLamp(index) {
   const chosen = chosenLamps() ?? [];
-  showLamps(chosen.includes(index) ? chosen.filter((each) => each !== index) : [...chosen, index]);
+  lights.value = rangesOf(chosen.includes(index) ? chosen.filter((each) => each !== index) : [...chosen, index]);
+  edited.add(lights);
   notify();
 }
 
-/** Write the numbers of lamps as ranges. */
-function showLamps(indices) {
+/** Return the numbers of lamps as ranges. */
+function rangesOf(indices) {
   const runs = [];
   for (const index of [...indices].sort((one, other) => one - other)) {
     if (runs.at(-1)?.[1] === index - 1) runs.at(-1)[1] = index;
     else runs.push([index, index]);
   }
-  lights.value = runs.map(([first, last]) => (first === last ? `${first + 1}` : `${first + 1}-${last + 1}`)).join(", ");
+  return runs.map(([first, last]) => (first === last ? `${first + 1}` : `${first + 1}-${last + 1}`)).join(", ");
 }
 
 /** Start a capture with the values of the form and some others. */
@@ -57,18 +60,25 @@ export async function start(changes = {}) {
   if (!byId("run").reportValidity()) return;
   const choices = { plan: planned().sequences.join(","), exposures_s: times, tracking_every: tracking.value ? Number(tracking.value) : null,
     lights: chosen && chosen.map((index) => lamps[index].name) };
-  await attempt(() => post("/set/run", { name: name.value, ...choices, ...changes }));
+  await attempt(() => once(start, () => ask("run", { name: name.value, ...choices, ...changes })));
+}
+
+/** Ask the server for something; the form is then as it tells, but for what is changed from now on. */
+function ask(what, values) {
+  edited.clear();
+  return post(`/set/${what}`, values);
 }
 
 /** Show a capture that was taken before. */
 export function open(capture) {
-  return attempt(() => post("/set/open", { name: capture }));
+  return attempt(() => ask("open", { name: capture }));
 }
 
-/** Fill in a name and the names of sequences. */
+/** Fill in a name and the names of sequences for a person. */
 export function fill(values) {
   name.value = values.name;
   plan.value = values.plan;
+  edited.add(name).add(plan);
 }
 
 /** Take notice of the captures that there are, and of the one that is shown; a person's own words stay. */
@@ -76,10 +86,9 @@ export function follow(before, state) {
   byId("captures").replaceChildren(...state.captures.map((value) => element("option", { value })));
   const { chosen } = state;
   if (state.name === "" || (before !== null && before.name === state.name && JSON.stringify(before.chosen) === JSON.stringify(chosen))) return;
-  fill({ name: state.name, plan: chosen.plan });
-  exposures.value = chosen.exposures_s.join(", ");
-  tracking.value = chosen.tracking_every ?? "";
-  showLamps((chosen.lights ?? []).map((light) => lamps.findIndex((lamp) => lamp.name === light)));
+  const told = [[name, state.name], [plan, chosen.plan], [exposures, chosen.exposures_s.join(", ")], [tracking, chosen.tracking_every ?? ""],
+    [lights, rangesOf((chosen.lights ?? []).map((light) => lamps.findIndex((lamp) => lamp.name === light)))]];
+  for (const [field, value] of told) if (!edited.has(field)) field.value = value;
   if (chosen.exposures_s.length || chosen.tracking_every !== null || chosen.lights !== null) byId("more").open = true;
 }
 
@@ -92,11 +101,15 @@ export function mountForm(rig, changed) {
     event.preventDefault();
     start();
   });
+  for (const each of [name, plan, exposures, tracking, lights]) each.addEventListener("input", () => edited.add(each));
   for (const each of [name, plan]) each.addEventListener("input", changed);
   for (const each of [exposures, lights]) each.addEventListener("input", () => each.setCustomValidity(""));
   lights.addEventListener("input", changed);
   name.addEventListener("change", () => [...byId("captures").options].some(({ value }) => value === name.value) && open(name.value));
   byId("meter").addEventListener("click", () => start({ preview: true }));
   byId("stop").addEventListener("click", () => attempt(() => post("/set/stop")));
-  byId("confirm").addEventListener("click", () => attempt(() => post("/set/confirm")));
+  byId("confirm").addEventListener("click", () => attempt(async () => {
+    show(byId("please"), false); // a second click would be an answer to the next question
+    await post("/set/confirm").catch((error) => { show(byId("please"), true); throw error; });
+  }));
 }

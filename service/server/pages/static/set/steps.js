@@ -1,7 +1,7 @@
 /** The list of what belongs to a capture: what is there, what is planned, and what its absence means. */
 
 import { attempt, post } from "../api.js";
-import { byId, element } from "../element.js";
+import { byId, element, setChildren } from "../element.js";
 import { LACKS } from "../pages/calibrations.js";
 import { fill, open, planned, start } from "./plan_form.js";
 
@@ -26,7 +26,7 @@ function following(name, captures) {
   for (let number = 2; ; number += 1) if (!captures.includes(`${stem}-${number}`)) return `${stem}-${number}`;
 }
 
-/** Return the state of a step, and the button that changes it. */
+/** Return the state of a step, and the words and the action of the button that changes it. */
 function stateOf(step, state, changed) {
   const { name, sequences } = planned();
   const shots = state.name === name ? state.shots.filter((shot) => shot.step === step.id) : [];
@@ -35,7 +35,7 @@ function stateOf(step, state, changed) {
   const begun = state.name === name && state.shots.some((shot) => shot.taken);
   const isPlanned = sequences.some((word) => step.takes.includes(word));
   const alone = `${name}-${step.id}`;
-  const button = (words, action) => element("button", { type: "button", class: "quiet", disabled: state.running, "aria-label": `${step.name}: ${words}`, onclick: action }, words);
+  const button = (words, action) => ({ words, action });
   const plan = (words, values) => button(words, () => { fill(values); changed(); });
   const usable = state.name === name && state.version !== null && step.id in state.calibrations;
   const done = usable && state.calibrations[step.id] ? ` ${step.used}` : "";
@@ -60,13 +60,22 @@ function stateOf(step, state, changed) {
  */
 export function mountSteps(patterns, changed) {
   const list = [...STEPS, ...(patterns.length ? [PROJECTOR] : []), { ...OBJECT, takes: ["olat", "gradients", "polarised", ...patterns] }];
+  const lines = new Map(list.map((step) => [step, element("li", { "data-step": step.id })]));
+  byId("steps").replaceChildren(...lines.values());
   return (state) => {
-    const focused = byId("steps").contains(document.activeElement) ? document.activeElement.closest("li").dataset.step : null;
-    byId("steps").replaceChildren(...list.map((step) => {
-      const { mark, words, button } = stateOf(step, state, changed);
-      const sign = { there: "✓ ", wrong: "! ", "": "○ " }[mark];
-      return element("li", { "data-step": step.id }, element("strong", {}, element("span", { class: `mark ${mark}`, "aria-hidden": "true" }, sign), step.name), button ?? "", element("p", { class: "help" }, words));
-    }));
-    if (focused !== null) byId("steps").querySelector(`[data-step=${focused}] button`)?.focus();
+    for (const [step, line] of lines) present(line, step, state, stateOf(step, state, changed));
   };
+}
+
+/** Show a step; its button stays as long as it does the same, and with it the focus and a click that has begun. */
+function present(line, step, { running }, { mark, words, button }) {
+  const before = line.querySelector("button");
+  const stays = before !== null && before.textContent === button?.words;
+  const shown = button === null || stays ? before : element("button", { type: "button", class: "quiet", "aria-label": `${step.name}: ${button.words}` }, button.words);
+  if (button !== null) Object.assign(shown, { onclick: button.action, disabled: running });
+  const isFocused = before !== null && before === document.activeElement;
+  const sign = { there: "✓ ", wrong: "! ", "": "○ " }[mark];
+  setChildren(line, [element("strong", {}, element("span", { class: `mark ${mark}`, "aria-hidden": "true" }, sign), step.name), ...(button === null ? [] : [shown]),
+    element("p", { class: "help" }, words)]);
+  if (isFocused && !stays) line.querySelector("button")?.focus();
 }

@@ -97,7 +97,7 @@ async function end(what, found, line, status, link) {
   line.append(await proposalOf(found, async (importing) => {
     status.textContent = "being imported";
     const imported = await settled(importing, "captures", link);
-    if (imported.state === "ready" && isOnly(line)) location.assign(`/object/${imported.id}`);
+    if (imported.state === "ready" && [...byId("uploads").children].every((each) => each === line || !isUnderWay(each))) location.assign(`/object/${imported.id}`);
     else if (imported.state === "ready") await end(what, imported, line, status, link);
     else status.textContent = "";
     await changed(what);
@@ -105,9 +105,9 @@ async function end(what, found, line, status, link) {
   }));
 }
 
-/** Return whether nothing else is sent, looked at or asked about, so that the page may be left. */
-function isOnly(line) {
-  return [...byId("uploads").querySelectorAll("progress, .proposal")].every((each) => line.contains(each));
+/** Return whether what a line is about is still sent, looked at or asked about. */
+export function isUnderWay(line) {
+  return line.querySelector("progress, .proposal") !== null;
 }
 
 async function take(found) {

@@ -4,6 +4,7 @@
 
 import { addSpace } from "./colour_spaces.js";
 
+const MOST_BETWEEN = 1 << 16; // bytes that are rather read in vain than asked around
 const KEPT_TILES = 192; // of 256 × 256 × 3 floats: 150 MB
 
 /** A tile of a layer. @typedef {{rows: number, cols: number, planes: Float32Array[]}} Tile */
@@ -35,9 +36,25 @@ export class ViewFile {
   }
 
   /** Return the bytes of a block. */
-  async block([offset, length]) {
-    const packed = await this.#files.bytes("view.bin", offset, length);
-    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+  block(place) {
+    return this.blocks([place])[0];
+  }
+
+  /** Return the bytes of blocks as promises; those that lie beside each other come with one request. */
+  blocks(places) {
+    const parts = []; // of the file
+    for (const [offset, length] of places.toSorted((one, other) => one[0] - other[0])) {
+      const last = parts.at(-1);
+      if (last !== undefined && offset - last.end <= MOST_BETWEEN) last.end = offset + length;
+      else parts.push({ begin: offset, end: offset + length });
+    }
+    for (const part of parts) part.bytes = this.raw(part.begin, part.end - part.begin);
+    const found = places.map(async ([offset, length]) => {
+      const { begin, bytes } = parts.findLast((part) => part.begin <= offset);
+      return inflated(new Uint8Array(await bytes, offset - begin, length));
+    });
+    for (const each of found) each.catch(() => {}); // whoever waits for it is told
+    return found;
   }
 
   /** Return bytes of view.bin as they are. */
@@ -46,8 +63,17 @@ export class ViewFile {
   }
 
   /** Return the thumbnails of the frames in one image. */
-  async thumbnails() {
-    return createImageBitmap(new Blob([await this.#files.bytes("thumbnails.jpg")], { type: "image/jpeg" }));
+  thumbnails() {
+    return this.#picture("thumbnails.jpg");
+  }
+
+  /** Return the object under a light from above right of the camera, a small picture. */
+  card() {
+    return this.#picture("card.jpg");
+  }
+
+  async #picture(name) {
+    return createImageBitmap(new Blob([await this.#files.bytes(name)], { type: "image/jpeg" }));
   }
 
   /**
@@ -88,6 +114,10 @@ export class ViewFile {
     const found = await this.tile(layer, 0, Math.floor(row / tile) * Math.ceil(cols / tile) + Math.floor(col / tile));
     return found.planes.map((plane) => plane[(row % tile) * found.cols + (col % tile)]);
   }
+}
+
+function inflated(packed) {
+  return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
 }
 
 /** Return numbers of a block as floats. */

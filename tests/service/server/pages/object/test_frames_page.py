@@ -18,6 +18,14 @@ pytestmark = pytest.mark.long
 FRAMES = 12
 MOST_OPEN = 4
 """Pictures that are decoded at one time: three that come, and one that is shown."""
+PARALLEL = 3
+"""Pictures that are asked for at one time."""
+LOOK = """() => document.querySelector('.frames-picture').getContext('2d').getImageData(0, 0, 128, 128).data
+  .reduce((sum, each, at) => sum + each * (at % 97), 0)"""
+FAIL_ONCE = """() => {
+  const decode = createImageBitmap;
+  globalThis.createImageBitmap = async () => { globalThis.createImageBitmap = decode; throw new Error("unreadable"); };
+}"""
 COUNT_BITMAPS = """globalThis.openBitmaps = globalThis.mostOpen = 0;
 const decode = createImageBitmap, close = ImageBitmap.prototype.close;
 globalThis.createImageBitmap = async (...given) => {
@@ -70,13 +78,25 @@ def test_a_picture_that_does_not_come_is_said_in_words_and_asked_for_again(page,
         else:
             route.continue_()
 
+    under_way, most = set(), []
+
+    def follow(request) -> None:
+        if "/pictures/" in request.url:
+            under_way.symmetric_difference_update([request])
+            most.append(len(under_way))
+
+    for event in ("request", "requestfinished", "requestfailed"):
+        page.on(event, follow)
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     page.route("**/pictures/frame.0001.exr", answer)
     page.route("**/pictures/frame.0003.exr", lambda route: route.fulfill(body=b"no picture") if lost[0] else route.continue_())
     page.goto(f"{solved.pages['object']}#mode=frames")
     page.get_by_text(f"frame.0001.exr (1 of {FRAMES}) has no picture. <img").wait_for()
+    page.get_by_role("button", name="missing picture").click()  # while others are still loaded, which doubles nothing
     again = page.get_by_role("button", name="Try 2 missing pictures again")
     again.wait_for()
+    expect(page.locator(".frames-picture.missing")).to_have_count(1)
+    expect(page.locator(".filmstrip .icon")).to_have_count(2)
     page.get_by_role("button", name="Frame 3").click()
     page.get_by_text(f"(3 of {FRAMES}) has no picture. The browser cannot").wait_for()
     expect(page.get_by_role("button", name="Save a video")).to_have_count(0)  # a video with gaps would be no video of the frames
@@ -86,6 +106,13 @@ def test_a_picture_that_does_not_come_is_said_in_words_and_asked_for_again(page,
     page.get_by_text(f"frame.0003.exr (3 of {FRAMES})", exact=True).wait_for()
     expect(again).to_be_hidden()
     page.get_by_role("button", name="Save a video").wait_for()
+    assert max(most) <= PARALLEL
+    before = page.evaluate(LOOK)
+    page.evaluate(FAIL_ONCE)
+    page.evaluate("() => [4, 5].forEach((each) => document.querySelector(`[aria-label='Frame ${each}']`).click())")
+    page.wait_for_function(f"(before) => ({LOOK})() !== before", arg=before)  # it is not held up by the one that cannot be read
+    expect(page.locator(".filmstrip li:nth-child(4) .icon")).to_have_count(1)
+    expect(page.locator(".frames-picture.missing")).to_have_count(0)
 
 
 def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
@@ -96,12 +123,10 @@ def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
     expect(page.locator(".filmstrip li")).to_have_count(FRAMES)
     expect(page.locator("[data-shows=frames] img")).to_have_count(0)
     expect(page.get_by_label("Frames of").locator("option").first).to_contain_text("<img")
-    look = """() => document.querySelector('.frames-picture').getContext('2d').getImageData(0, 0, 128, 128).data
-      .reduce((sum, each, at) => sum + each * (at % 97), 0)"""
-    first = page.evaluate(look)
+    first = page.evaluate(LOOK)
     page.get_by_role("button", name="Frame 3").click()
     page.get_by_text(f"frame.0003.exr (3 of {FRAMES})").wait_for()
-    page.wait_for_function(f"(first) => ({look})() !== first", arg=first)  # it is decoded when it is chosen
+    page.wait_for_function(f"(first) => ({LOOK})() !== first", arg=first)  # it is decoded when it is chosen
     page.get_by_role("button", name="Play").click()
     page.wait_for_function("() => document.querySelector('.frames-bar input').value < 2")  # after the last comes the first
     page.get_by_role("button", name="Play").click()

@@ -96,8 +96,17 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
 
 @pytest.mark.long
 def test_arrow_keys_move_the_light(page, solved):
+    """Also while the first picture stands for one that is still loaded."""
+    held, holds = [], [True]
+    page.route("**/view.bin", lambda route: held.append(route) if holds[0] else route.continue_())
     page.goto(f"/light/{solved.capture}")
+    page.locator("canvas.picture[data-shown=card]").press("ArrowRight")
+    seen(page, lambda: held, "no block is asked for")
+    holds[0] = False
+    while held:
+        held.pop().continue_()
     solved.wait_for_content(page, "light")
+    assert page.evaluate("() => relit.state().light.direction[0]") > 0.46  # 0.45 at first
     expect(page.get_by_label("View transform")).to_have_value("srgb")
     before = page.evaluate("() => relit.state().light.direction")
     page.locator("canvas.dome").focus()

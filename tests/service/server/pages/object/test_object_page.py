@@ -99,7 +99,7 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
         found["jobs"] = [{**job, "state": "running"} if job["request"].get("maps") else job for job in found["jobs"]]
         route.fulfill(response=answer, json=found)
 
-    page.route("**/v1/jobs?limit=500&state=succeeded&state=queued&state=running", unprepared)
+    page.route("**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", unprepared)
     page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
     page.goto(f"{made.pages['object']}#mode=photographs")
     page.locator("[data-shows=photographs] figure canvas").first.wait_for()
@@ -269,7 +269,7 @@ def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
     page.mouse.move(middle[0] + 60, middle[1] + 40)
     page.mouse.up()
     page.get_by_label("Text of the note").fill("a region")
-    page.get_by_role("button", name="Keep the note").click()
+    page.get_by_role("button", name="Keep the note").dblclick()
     page.locator(".notes > button").nth(1).wait_for()
     page.locator("canvas.picture").focus()
     page.keyboard.press("+")  # the marks go with the picture

@@ -60,9 +60,13 @@ void main() {
 
 const SLICE = 1 << 18; // pixels that are put into a texture at once
 
-/** Return whether this browser can relight. */
-export function canRender() {
-  return document.createElement("canvas").getContext("webgl2") !== null;
+/** Return whether this browser can relight, on a canvas if one is given. */
+export function canRender(canvas = document.createElement("canvas")) {
+  return contextOf(canvas) !== null;
+}
+
+function contextOf(canvas) {
+  return canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
 }
 
 export class BasisRenderer {
@@ -73,10 +77,9 @@ export class BasisRenderer {
    * @param {HTMLCanvasElement} canvas As large as the coefficient images.
    * @param {any} relight Of view.json.
    * @param {string} space Working space of the coefficient images.
-   * @param {Uint16Array} tiles Index of each tile.
    */
-  constructor(canvas, relight, space, tiles) {
-    const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
+  constructor(canvas, relight, space) {
+    const gl = contextOf(canvas);
     this.#gl = gl;
     this.canvas = canvas;
     this.relight = relight;
@@ -102,10 +105,6 @@ export class BasisRenderer {
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGB32F, relight.terms, 2 * relight.tiles.count);
     this.#sampling(gl.TEXTURE_2D);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.activeTexture(gl.TEXTURE3);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R16UI, relight.tiles.cols, relight.tiles.rows, 0, gl.RED_INTEGER, gl.UNSIGNED_SHORT, tiles);
-    this.#sampling(gl.TEXTURE_2D);
     this.setView(null);
     this.timer = new FrameTimer(gl);
   }
@@ -132,10 +131,20 @@ export class BasisRenderer {
 
   /** Take the coverage: bytes [rows, cols]. */
   setMatte(coverage) {
+    this.#setTable(1, this.relight, ["R8", "RED", "UNSIGNED_BYTE"], coverage);
+  }
+
+  /** Take the index of each tile. */
+  setTiles(index) {
+    this.#setTable(3, this.relight.tiles, ["R16UI", "RED_INTEGER", "UNSIGNED_SHORT"], index);
+  }
+
+  #setTable(unit, { rows, cols }, names, values) {
     const gl = this.#gl;
-    gl.activeTexture(gl.TEXTURE1);
+    const [stored, format, type] = names.map((name) => gl[name]);
+    gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, this.relight.cols, this.relight.rows, 0, gl.RED, gl.UNSIGNED_BYTE, coverage);
+    gl.texImage2D(gl.TEXTURE_2D, 0, stored, cols, rows, 0, format, type, values);
     this.#sampling(gl.TEXTURE_2D);
   }
 

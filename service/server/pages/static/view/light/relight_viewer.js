@@ -20,6 +20,9 @@ const BEYOND_SHARE = 0.05; // from which the commands warn too
 const SPIN_DEGREES_PER_S = 30;
 const FIRST_LIGHT = [0.45, 0.5, 0.74]; // above right of the camera
 const BACKDROP = 0.2; // encoded grey around the object, the same in light and dark, since colours are judged before it
+const AROUND = `rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`;
+const SAME = 0.01; // of a direction
+const REQUESTS = 4; // that the coefficient images come with
 const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The frames can still be made by a job, and the captured images looked at.";
 
 /**
@@ -35,10 +38,6 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  */
 export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
-  if (!canRender()) {
-    parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, settled: async () => {}, canvas: null, over: null, turn: () => {} };
-  }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
   const drawn = element("canvas", { width: relight.cols, height: relight.rows });
@@ -51,27 +50,47 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const zoomed = mountZoomed(stage, front, place, { changed: onGesture, pixelSize, still: embedded });
   const { canvas } = zoomed;
   stage.append(warning);
-
-  const { quadrature } = relight;
-  const [inverse, beyond, outside, captured, index] = await Promise.all([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index].map((block) => view.block(block)));
-  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
-  const tiles = new Uint16Array(index);
-  const renderer = new BasisRenderer(drawn, relight, view.info.color_space, tiles);
-  const matte = new Uint8Array(await view.block(relight.matte));
-  renderer.setMatte(matte);
-  const exposure = new Exposure(relight, matte, tiles);
-  const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
-  const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
+  let loop = null; // until the picture can be drawn here
   let map = null; // { id, name, profile }
   let chosen = null; // stands for the environment that was chosen last, which may still come
   let asked = false;
-  const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
-  const loop = new DrawLoop(renderer, show);
 
   const address = embedded ? null : new ControlAddress({ on: control.lit, brightness: control.brightness, colour: control.colour, size: control.size,
     environment: control.environment, "environment-stops": control.environmentStops, turn: control.turn, stops: control.exposure, view: control.view,
     compare: control.compare, wipe: control.wipe });
   const given = address?.read() ?? [];
+  const isFirst = !embedded && given.length === 0 && FIRST_LIGHT.every((part, axis) => Math.abs(part - place.light[axis]) < SAME);
+  const card = isFirst ? view.card() : Promise.reject(); // a view that an earlier build has made has none
+
+  const { quadrature } = relight;
+  const tables = view.blocks([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index, relight.matte]);
+  const each = Math.ceil(relight.terms / REQUESTS);
+  const terms = relight.basis.flatMap((_, at) => (at % each === 0 ? view.blocks(relight.basis.slice(at, at + each)) : []));
+  await card.then(showCard, () => {}); // before the graphics processor is waited for
+  if (!canRender(drawn)) {
+    parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, settled: async () => {}, canvas: null, over: null, turn: () => {} };
+  }
+  const renderer = new BasisRenderer(drawn, relight, view.info.color_space); // its program is compiled while the blocks come
+  const [inverse, beyond, outside, captured, index, coverage] = await Promise.all(tables);
+  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
+  const [tiles, matte] = [new Uint16Array(index), new Uint8Array(coverage)];
+  renderer.setTiles(tiles);
+  renderer.setMatte(matte);
+  const exposure = new Exposure(relight, matte, tiles);
+  const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
+  const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
+  const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
+  loop = new DrawLoop(renderer, show);
+
+  /** Show the object as the server has lit it, until it is lit here. */
+  async function showCard(picture) {
+    [front.width, front.height] = [picture.width, picture.height];
+    front.getContext("2d").drawImage(picture, 0, 0);
+    canvas.dataset.shown = "card";
+    zoomed.draw(AROUND);
+    await new Promise((resolve) => { requestAnimationFrame(() => setTimeout(resolve)); });
+  }
 
   function move(direction) {
     place.set({ light: direction });
@@ -103,6 +122,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   }
 
   function change() {
+    if (loop === null) return;
     for (const each of Object.values(control)) each.dispatchEvent(new Event("set"));
     domeControl.set(control.lit.checked ? place.light : null);
     address?.write();
@@ -134,8 +154,8 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     const [width, height] = renderer.sizeOf(stride);
     if (front.width !== width || front.height !== height) [front.width, front.height] = [width, height];
     front.getContext("2d").drawImage(drawn, 0, drawn.height - height, width, height, 0, 0, width, height);
-    canvas.dataset.stride = String(stride);
-    zoomed.draw(`rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`);
+    Object.assign(canvas.dataset, { stride, shown: "live" });
+    zoomed.draw(AROUND);
     const { framesPerSecond, gpuMs } = renderer.timer.figures();
     const size = stride === 1 ? "" : `, at ${width} × ${height} pixels until it is still`;
     if (framesPerSecond !== null) speed.textContent = `${sizeOf(relight)}: ${framesPerSecond.toFixed(0)} pictures a second${gpuMs === null ? "" : `, ${gpuMs.toPrecision(2)} ms each on the graphics processor`}${size}.`;
@@ -241,15 +261,17 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     spinning = requestAnimationFrame(step);
   });
 
-  await Promise.all(relight.basis.map(async (block, term) => {
-    const planes = new Uint16Array(await view.block(block));
+  await Promise.all(terms.map(async (block, term) => {
+    const planes = new Uint16Array(await block);
     await renderer.setTerm(term, planes);
     exposure.setTerm(term, planes);
   }));
   if (given.includes("environment") && control.environment.value === "") tell("The environment of this address is not on this server. Choose another.");
   if (control.environment.value !== "") {
-    const { name, data } = await load(control.environment.value);
-    await useEnvironment(control.environment.value, name, data);
+    const { value } = control.environment;
+    const isWanted = () => chosen === null && control.environment.value === value; // else another was chosen meanwhile
+    const { name, data } = await load(value);
+    await useEnvironment(value, name, data, isWanted);
   }
   if (given.includes("view")) await attemptHere(useView);
   if (!given.includes("stops")) expose();

@@ -88,7 +88,7 @@ export class TiledImage {
       if (this.#painted.size > KEPT) this.#painted.delete(this.#painted.keys().next().value);
       this.#changed();
     }, (error) => {
-      this.#painted.delete(key);
+      if (this.#painted.get(key) === pending) this.#painted.delete(key);
       this.#failed(error);
     });
     this.#painted.set(key, pending);
