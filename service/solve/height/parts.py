@@ -219,8 +219,8 @@ class _Scene:
         thinned = np.ascontiguousarray(self._height[self._thin], dtype=np.float32)
         height = wp.array(thinned, dtype=float, device=self._device)
         thickness = wp.array(self._thickness.astype(np.float32), dtype=float, device=self._device)
-        shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, extent_of(thinned, self._thin_part == number).box,
-                             self._projection)
+        box = extent_of(thinned, self._thin_part == number).box
+        shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, box, self._projection)
         evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self.size, blur=self._blur)
         return choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
 
