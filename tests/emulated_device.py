@@ -72,6 +72,7 @@ class Memory:
         self._sizes: dict[int, int] = {}
         self._begins: list[int] = []
         self._lock = RLock()
+        self.held = self.peak = 0  # bytes now, and the most since `peak` was set
 
     def allocate(self, size: int) -> int:
         begin = context.runtime.core.wp_alloc_host(size + GUARD, None)
@@ -79,6 +80,8 @@ class Memory:
         with self._lock:
             self._sizes[begin] = size
             bisect.insort(self._begins, begin)
+            self.held += size
+            self.peak = max(self.peak, self.held)
         return begin
 
     def deallocate(self, begin: int, size: int) -> None:
@@ -87,6 +90,7 @@ class Memory:
         with self._lock:
             self._begins.remove(begin)
             given = self._sizes.pop(begin)
+            self.held -= given
         sound = (bytes_at(begin + given, GUARD) == UNWRITTEN).all()
         context.runtime.core.wp_free_host(begin)
         if not sound:
@@ -94,8 +98,7 @@ class Memory:
 
     @property
     def free(self) -> int:
-        with self._lock:
-            return MEMORY - sum(self._sizes.values())
+        return MEMORY - self.held
 
     def has(self, begin: int, size: int) -> bool:
         with self._lock:
