@@ -235,7 +235,9 @@ def estimate_rows(device: Published = H200) -> list[str]:
             f"{SOURCES} Counts are those of scenes of {counted} pixels squared on the emulated device, "
             f"seconds of {' and '.join(map(str, TIMED_SIDES))} pixels squared, continued in a line to the full size. For the counts all "
             "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size; a CUDA graph "
-            f"is one launch. Bytes and seconds for patches of bounced light, {interreflection.PATCHES} at most, are counted apart.", "",
+            "is one launch. Frames are counted as one chunk; the product makes as many at one time as 1/16 of the memory of the device "
+            "holds, and computes what the model responds again for each chunk. Bytes and seconds for patches of bounced light, "
+            f"{interreflection.PATCHES} at most, are counted apart.", "",
             *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
 
 

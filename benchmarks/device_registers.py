@@ -52,7 +52,7 @@ def register_rows() -> list[str]:
              "scheduler with w warps takes max(instructions, instructions · stall / w) cycles for each warp: more warps win nothing once "
              "w reaches the stall, and instructions that spill and reload only cost. Each instruction counts once, also in loops; waits "
              "for memory are left out, of which more warps hide more, and spills add some.", "",
-             "| kernel | registers | warps | instructions | stall | cycles | held: warps | spilled bytes of a thread | spill instructions "
+             "| kernel | registers | warps | instructions | stall | cycles | held: warps | bytes of stack | spill instructions "
              "| instructions | stall | cycles | cycles, held over as they are |", "|" + "---|" * 13]
     for name, known in HOT.items():
         if known.registers > BOUND:

@@ -11,6 +11,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import once
+from kernels.pack_access import pack_load
 from kernels.packs import new_array, pack_type
 from kernels.stereo.cost import CHANCE, Labels, Margins, sliding
 from kernels.stereo.paths import FAR
@@ -113,6 +114,7 @@ def _other_kernel(pack: int) -> Any:
 @once
 def _choice_kernel(pack: int) -> Any:
     cost_pack, sum_pack = pack_type(pack, wp.uint8), pack_type(pack, wp.int16)
+    load_costs, load_sums = pack_load(pack, wp.uint8, 3), pack_load(pack, wp.int16, 3)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def choice_kernel(first: int,
@@ -133,12 +135,12 @@ def _choice_kernel(pack: int) -> Any:
         packs = volume.shape[2]
         r = i // cols
         c = i - r * cols
-        least = sums[r, c, 0]
+        least = load_sums(sums, r, c, 0)
         held = sum_pack()
         for k in range(pack):
             held[k] = wp.int16(k)
         for j in range(1, packs):
-            here = sums[r, c, j]
+            here = load_sums(sums, r, c, j)
             for k in range(pack):
                 held[k] = wp.where(here[k] < least[k], wp.int16(j * pack + k), held[k])
             for k in range(pack):
@@ -170,7 +172,7 @@ def _choice_kernel(pack: int) -> Any:
                 y = wp.clamp(r + SPREAD * dy, 0, rows - 1)
                 for dx in range(-1, 2):
                     x = wp.clamp(c + SPREAD * dx, 0, cols - 1)
-                    costs = volume[y, x, j]
+                    costs = load_costs(volume, y, x, j)
                     for k in range(pack):
                         around[k] = around[k] + wp.int16(costs[k])
             for k in range(pack):

@@ -22,6 +22,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.carries import EMPTY_CHI2, LEVEL_ERROR, NO_EDGE, Code, carry_kernel, weight_of_reading
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
@@ -121,7 +122,7 @@ def append_digit(digit: int, base: int, reflected: int, number: wp.ref[int], dig
 @once
 def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
-    cut_of = cut_in(pack)
+    cut_of, load = cut_in(pack), pack_load(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def kary_kernel(first: int,
@@ -143,8 +144,8 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         cut = cut_of(saturated, masks, p)
         lit, signal = float_pack(), float_pack()
         for channel in range(channels):
-            on = values[code.white * channels + channel, p]
-            off = values[code.black * channels + channel, p]
+            on = load(values, code.white * channels + channel, p)
+            off = load(values, code.black * channels + channel, p)
             for k in range(pack):
                 contrast = wp.max(on[k] - off[k], 0.0)
                 lit[k] = lit[k] + contrast * contrast / (2.0 * code.read_variance + code.gain * (wp.max(on[k], 0.0) + wp.max(off[k], 0.0)))
@@ -167,9 +168,9 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
             for digit in range(base):
                 cost = float_pack()
                 for channel in range(channels):
-                    on = values[code.white * channels + channel, p]
-                    off = values[code.black * channels + channel, p]
-                    reading = values[frame * channels + channel, p]
+                    on = load(values, code.white * channels + channel, p)
+                    off = load(values, code.black * channels + channel, p)
+                    reading = load(values, frame * channels + channel, p)
                     level = code.expected[digit, channel]
                     for k in range(pack):
                         miss = reading[k] - off[k] - level * wp.max(on[k] - off[k], 0.0)

@@ -8,6 +8,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, band_of, pack_type
 
 
@@ -67,13 +68,13 @@ def saturated_bits(saturated: np.ndarray) -> np.ndarray:
 @once
 def cut_in(pack: int) -> Any:
     """Return the Warp function that gives the bits of the frames of a mask that saturate at each pixel of a pack; 0 where none does."""
-    int_pack, byte_pack = pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    int_pack, byte_pack, load_byte = pack_type(pack, wp.int32), pack_type(pack, wp.uint8), pack_load(pack, wp.uint8)
 
     @wp.func
     def cut_of(saturated: wp.array2d(dtype=byte_pack), masks: wp.array(dtype=int), p: int):
         cut = int_pack()
         for group in range(masks.shape[0]):
-            flags = saturated[group, p]
+            flags = load_byte(saturated, group, p)
             mask = masks[group]
             for k in range(pack):
                 cut[k] = cut[k] | (int(flags[k]) & mask)

@@ -19,6 +19,7 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.elementary import angle_of
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
 from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
@@ -215,7 +216,7 @@ def write_phases_in(pack: int) -> Any:
 @once
 def _phase_kernel(pack: int, ambient: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
-    cut_of, write_phases = cut_in(pack), write_phases_in(pack)
+    cut_of, write_phases, load = cut_in(pack), write_phases_in(pack), pack_load(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def phase_kernel(first: int,
@@ -237,7 +238,7 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
         p = first + wp.tid()
         dark, dark_variance = float_pack(), float_pack()
         if wp.static(ambient):
-            dark = values[black, p]
+            dark = load(values, black, p)
             for k in range(pack):
                 dark_variance[k] = read_variance + gain * wp.max(dark[k], 0.0)
         for period in range(masks.shape[0]):
@@ -245,7 +246,7 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
             mean, along, across = float_pack(), float_pack(), float_pack()
             vaa, vcc, vss, vcs = float_pack(), float_pack(), float_pack(), float_pack()
             for n in range(starts[period], starts[period + 1]):
-                reading = values[order[n], p]
+                reading = load(values, order[n], p)
                 a, c, s = table[n][0], table[n][1], table[n][2]
                 for k in range(pack):
                     add_frame(reading[k], read_variance + gain * wp.max(reading[k], 0.0), a, c, s,

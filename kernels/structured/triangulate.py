@@ -15,6 +15,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import as_packs, pack_type, padded_count, zeros
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
@@ -236,6 +237,7 @@ def _projection(model: ProjectorModel) -> Any:
 @once
 def _kernel(pack: int, with_u: bool, with_v: bool) -> Any:
     float_pack, code_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    load, load_code = pack_load(pack, wp.float32, 1), pack_load(pack, wp.uint8, 1)
 
     @wp.kernel(enable_backward=False, module="unique")
     def triangulate_kernel(first: int,
@@ -257,17 +259,17 @@ def _kernel(pack: int, with_u: bool, with_v: bool) -> Any:
                            residual: wp.array(dtype=float_pack),  # [P]
                            status: wp.array(dtype=code_pack)):  # [P]
         i = first + wp.tid()
-        px, py = x[i], y[i]
+        px, py = load(x, i), load(y, i)
         pu, pv, su, sv = float_pack(), float_pack(), float_pack(), float_pack()
         cu, cv = code_pack(), code_pack()
         if wp.static(with_u):
-            pu = u[i]
-            su = sigma_u[i]
-            cu = status_u[i]
+            pu = load(u, i)
+            su = load(sigma_u, i)
+            cu = load_code(status_u, i)
         if wp.static(with_v):
-            pv = v[i]
-            sv = sigma_v[i]
-            cv = status_v[i]
+            pv = load(v, i)
+            sv = load(sigma_v, i)
+            cv = load_code(status_v, i)
         zs, ss, rs, codes = float_pack(), float_pack(), float_pack(), code_pack()
         for k in range(pack):
             code_u, code_v = int(cu[k]), int(cv[k])

@@ -76,7 +76,7 @@ def integrate_normals(
         Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual
         every few iterations. The inputs are read on the host, a band of rows at a time; arrays on a device are read back, and x and y
         may be views of one row and one column. Needs nine float32 per pixel beyond the inputs, and twelve where the surface breaks, of
-        which one is on the host.
+        which one is on the host; a GPU holds the inputs too until breaks are found.
     """
     options = options or IntegrationOptions()
     _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)

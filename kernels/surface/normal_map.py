@@ -15,7 +15,7 @@ the mean of a Gaussian cut at 0, and across v A times what it was. A sure normal
 The weight of the pair of two pixels is multiplied by HALF² / (HALF² + (σᵢ² + σⱼ²) / 2): among sure pixels the unsure ones follow.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -147,9 +147,16 @@ class NormalMap:
         self._normal, self._mask, self._x, self._y, self._sigma = normal, mask, x, y, sigma
         self.perspective, self.device = perspective, device
         self.rows, self.cols = mask.shape
+        self._sent: list[NormalBand] = []
 
-    def bands(self) -> Iterator[NormalBand]:
-        """Send the surface to the device band by band, from the first row to the last."""
+    def bands(self) -> Iterable[NormalBand]:
+        """Return the surface on the device band by band, from the first row to the last; on CUDA it is sent once."""
+        if self.device == "cpu":
+            return self._bands()
+        self._sent = self._sent or list(self._bands())
+        return self._sent
+
+    def _bands(self) -> Iterator[NormalBand]:
         step = max(1, BAND_PIXELS // self.cols)
         for first in range(0, self.rows, step):
             part = slice(first, min(first + step, self.rows) + 1)

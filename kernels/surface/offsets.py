@@ -46,6 +46,10 @@ OUTLINE_0, OUTLINE_1, OUTLINE_2 = 1.875, -1.25, 0.375
 parts have their largest and smallest gaps there; round ones have them elsewhere, and are too steep at the outline."""
 NO_GAP = -1.0e30
 """Stands for the largest gap where the path never crosses the surface that moves against the pixel."""
+AROUND = 2.0
+"""Pixels around the box of a part within which a path is followed: far more than rounding moves it."""
+STEEP = 0.01
+"""Motion in the picture, for a unit of length at unit distance, below which rounding may turn a path: it is followed in any case."""
 
 
 class PartShadows(NamedTuple):
@@ -54,7 +58,25 @@ class PartShadows(NamedTuple):
     highest: wp.array  # [pixels, lights] float32: largest height of the surface above the ray, over all of it that moves against the pixel
     lowest: wp.array  # [pixels, lights] float32: the least
     back: wp.array  # [pixels, lights] float32: least height of the guessed back above the ray
-    hidden: wp.array  # [pixels, lights] uint8: whether surface that moves with the pixel hides the light, whatever the offset
+    hidden: wp.array  # [pixels, lights] uint8: whether surface that moves with the pixel hides the light, whatever the offset; 0 where the
+    # path passes by the part that moves
+
+
+@wp.func
+def _passes_by(start: wp.vec3, way: wp.vec3, camera: Camera, u: float, v: float, box: wp.vec4i) -> bool:
+    """Return whether the picture of the line from a point at (u, v) never comes near a box of pixels."""
+    far = wp.where(camera.perspective, -start[2], 1.0)
+    turn = wp.where(camera.perspective, way[2], 0.0) / far
+    across, up = way[0] + start[0] * turn, way[1] + start[1] * turn
+    if across * across + up * up < STEEP * STEEP:
+        return False
+    right, down = camera.scale[0] * across, -camera.scale[1] * up
+    right, down = wp.where(right == 0.0, 1.0e-20, right), wp.where(down == 0.0, 1.0e-20, down)
+    left_at, right_at = (float(box[1]) - AROUND - u) / right, (float(box[3]) + 1.0 + AROUND - u) / right
+    upper_at, lower_at = (float(box[0]) - AROUND - v) / down, (float(box[2]) + 1.0 + AROUND - v) / down
+    entered = wp.max(wp.min(left_at, right_at), wp.min(upper_at, lower_at))
+    left = wp.min(wp.max(left_at, right_at), wp.max(upper_at, lower_at))
+    return left < wp.max(entered, 0.0)
 
 
 @wp.kernel
@@ -65,6 +87,7 @@ def _march(first: int,
            part: wp.array2d(dtype=wp.int32),
            thickness: wp.array2d(dtype=float),
            moving: int,
+           box: wp.vec4i,
            camera: Camera,
            # outputs
            highest: wp.array2d(dtype=float),
@@ -87,7 +110,10 @@ def _march(first: int,
         own = wp.uint8(0)
         crossed, last = wp.int32(0), wp.int32(-1)  # pixels on the way of the part that is crossed, and that part
         before, sooner, soonest, flat = float(0.0), float(0.0), float(0.0), bool(False)  # the last gaps to it, and whether it is flat
-        for _ in range(rows + cols):
+        steps = rows + cols
+        if part[row, col] < 0 or (not moves and _passes_by(start, way, camera, float(col) + 0.5, float(row) + 0.5, box)):
+            steps = 0
+        for _ in range(steps):
             point = start + travelled * way
             at = project(point, camera)
             c, r = int(wp.floor(at[0])), int(wp.floor(at[1]))
@@ -132,12 +158,13 @@ def _march(first: int,
 
 
 def march_part(
-    pixels: wp.array,  # [n] vec2i, row and column of pixels of some part
+    pixels: wp.array,  # [n] vec2i, row and column; those of no part find no gap
     toward: wp.array,  # [lights] vec3, unit directions to the lights
     height: wp.array,  # [rows, cols] float32, camera-frame z
     part: wp.array,  # [rows, cols] int32, the part of each pixel, below 0 outside
     thickness: wp.array,  # [rows, cols] float32, guessed distance from front to back, in the unit of the gaps
     moving: int,  # number of the part that moves against all others
+    box: wp.vec4i,  # first row and column of that part, and the last of each
     projection: Projection,
 ) -> PartShadows:
     """March from pixels to distant lights over a surface of which one part moves; not synchronised on CUDA.
@@ -148,7 +175,7 @@ def march_part(
         raise ArrayError(f"height is {height.shape}, part {part.shape}, thickness {thickness.shape}: give one of each for every pixel")
     shape, device = (pixels.shape[0], toward.shape[0]), height.device.alias
     found = PartShadows(*(wp.empty(shape, dtype=float, device=device) for _ in range(3)), wp.empty(shape, dtype=wp.uint8, device=device))
-    inputs = [pixels, toward, height, part, thickness, moving, projection.on_device()]
+    inputs = [pixels, toward, height, part, thickness, moving, box, projection.on_device()]
     devices.launch(_march, shape[0], inputs, list(found), device=device, uneven=True)
     return found
 

@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels import device as devices
 from kernels.images import ImagesOnDevice
 from kernels.relight.frames.combine import combine, combine_batch
+from kernels.relight.frames.halves import to_halves
 from service.requests.relight import CHUNK_FRAMES
 from stage.formats.exr_rows import BLOCK_ROWS
 from stage.stack.stack import PIXEL_PAD, Stack
@@ -17,8 +19,8 @@ CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
 CUDA_CHUNK_BYTES = 2 << 30
-"""The same for frames that a model guides on CUDA: its responses, and images that the device's memory does not hold, are brought once for
-each chunk."""
+"""The same for frames that a model guides on CUDA, on a device with much memory more: the model's responses, and images that the device's
+memory does not hold, are brought once for each chunk. The host has them as half, mostly."""
 BLOCK_BYTES = 1280 << 20
 """Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
 and 64 lights, a block of 64 frames has 128 rows; every block of every frame costs some milliseconds beyond its pixels."""
@@ -34,10 +36,11 @@ class RowBlock(NamedTuple):
     """The pixels of the rows in the stack; those of the last rows include its padding."""
 
 
-def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES, *, of_cuda: bool = False) -> int:
-    """Return how many whole frames a chunk holds, `most` at most; `of_cuda` says that a model guides them on CUDA."""
+def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES, *, guided_on: str = "cpu") -> int:
+    """Return how many whole frames a chunk holds, `most` at most, where a model guides them on a device."""
     channels, _, pixels = stack.shape
-    return max(1, min(most, (CUDA_CHUNK_BYTES if of_cuda else CHUNK_BYTES) // (4 * channels * pixels)))
+    memory = CHUNK_BYTES if guided_on == "cpu" else devices.batch_bytes(guided_on, CUDA_CHUNK_BYTES)
+    return max(1, min(most, memory // (4 * channels * pixels)))
 
 
 def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
@@ -52,7 +55,7 @@ def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
 
 
 def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Sequence[int] | None, *,
-                  pixels: slice | None = None) -> np.ndarray:
+                  pixels: slice | None = None, halves: bool = False) -> np.ndarray:
     """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
 
     Args:
@@ -61,16 +64,19 @@ def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Se
             frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
             faster product is used.
         pixels: of a block of rows; None: all.
+        halves: whether frames from CUDA are half, as `to_halves` makes them.
     """
     channels, _, count = images.stack.shape
     begin, end, _ = (pixels or slice(None)).indices(count)
     placed = weights if places is None or images.device == "cpu" else _placed(weights, places)
     bands = images.spans(4 * channels * CHUNK_FRAMES) if pixels is None else [(begin, end)]
     kept = slice(None) if places is None or len(placed) == len(weights) else list(places)
-    frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float32)
+    halved = halves and images.device != "cpu"
+    frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float16 if halved else np.float32)
     for start, stop in bands:
         band = images.band(start, stop, saturated=False)
-        found = combine(band, weights[0]).numpy()[None] if places is None else combine_batch(band, placed).numpy()[kept]
+        summed = combine(band, weights[0]).reshape((1, channels, -1)) if places is None else combine_batch(band, placed)
+        found = (to_halves(summed) if halved else summed).numpy()[kept]
         if frames is None:
             frames = found
         else:

@@ -21,6 +21,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.images import ImagesOnDevice
 from kernels.packs import Band
+from kernels.relight.frames.halves import to_halves
 from kernels.relight.frames.near_sum import sum_near
 from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs, share_beyond
 from kernels.relight.model.captured import Captured
@@ -182,12 +183,13 @@ class Guide:
         return mirrored
 
     def frames_on_device(self, weights: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
-                         specular: bool) -> tuple[np.ndarray, np.ndarray | None]:
+                         specular: bool, halves: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the plain frames of a chunk with what the model says they miss, made on CUDA and downloaded once, and their specular part.
 
         Args:
             weights: of the frames, as for combine.linear_frames.
             lights, places, specular: as for `correct_range`.
+            halves: whether the frames are half, as `to_halves` makes them; not where the specular part is wanted.
         """
         device, count = self._model.device, self.images.stack.pixel_count
         radiance = frames_on_device(self.images, weights, places)
@@ -205,6 +207,8 @@ class Guide:
             self._range.light_on_device(batch, self.images.pick(batch.pixels), self.images.stack.scale, self._visible(batch), light.chunk,
                                         use)
             done += len(batch.pixels)
+        if halves:
+            return np.stack([to_halves(radiance[place]).numpy() for place in places])[..., :count], None
         frames, mirror = (each.numpy()[list(places) if len(each) else [], :, :count] for each in (radiance, mirrored))
         return frames, mirror if specular else None
 

@@ -161,7 +161,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     in_rows = guide is None and not alone and chunk_frames(stack) < CHUNK_FRAMES  # a model looks at whole frames
-    whole = chunk_frames(stack) if guide is None else chunk_frames(stack, MODEL_CHUNK_FRAMES, of_cuda=device != "cpu")
+    whole = chunk_frames(stack) if guide is None else chunk_frames(stack, MODEL_CHUNK_FRAMES, guided_on=device)
     size = max(1, (ROW_CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=request.used_weights,
@@ -187,12 +187,13 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             _write_rows(files, form, weights, images, places, groups, writer, timings)
             continue
         colours: dict[str, np.ndarray] = {}
+        halves = not groups and form.as_computed(files)
         if guide is None:
             with timings.part("product"):
-                frames = linear_frames(images, weights, places)
+                frames = linear_frames(images, weights, places, halves=halves)
         else:
             with timings.part("guide"):
-                frames, specular = _guided(guide, light, places, specular=bool(form.parts))
+                frames, specular = _guided(guide, light, places, specular=bool(form.parts), halves=halves)
             if specular is not None:
                 colours[Layer.SPECULAR] = specular
         if groups:
@@ -208,7 +209,7 @@ def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarr
     with writer.in_rows(files, form) as put:
         for block in row_blocks(images.stack, form.resolution[0], len(files) * (1 + len(groups))):
             with timings.part("product"):
-                frames = linear_frames(images, weights, places, pixels=block.pixels)
+                frames = linear_frames(images, weights, places, pixels=block.pixels, halves=not groups and form.as_computed(files))
             with timings.part("single lights"):
                 colours = _lights_alone(groups, frames, images, places, None, block.pixels)
             with timings.part("waiting for files"):
@@ -216,12 +217,13 @@ def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarr
 
 
 def _guided(guide: Guide, lights: Sequence[FrameLight], places: Sequence[int] | None, *,
-            specular: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return frames with what the model says that plain ones miss, and their specular part where it is wanted."""
+            specular: bool, halves: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return frames with what the model says that plain ones miss, and their specular part where it is wanted.
+    `halves`: whether frames of a range from CUDA are half."""
     weights = np.stack([each.weights for each in lights])
     of_range = [each.spread for each in lights if each.spread is not None]
     if of_range and places is not None and guide.images.device != "cpu":
-        return guide.frames_on_device(weights, of_range, places, specular=specular)
+        return guide.frames_on_device(weights, of_range, places, specular=specular, halves=halves)
     frames = linear_frames(guide.images, weights, places)
     if of_range and places is not None:
         return frames, guide.correct_range(frames, of_range, places, specular=specular)

@@ -24,6 +24,9 @@ from stage.results.maps import LOBES, SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
+CUDA_BATCH_PIXELS = 1 << 19
+"""The same on CUDA, where each batch is some hundred launches: with 96 lights 0.4 GB, and of a thousand lights no more values than 32
+bits count."""
 KEPT_BYTES = 1 << 30
 """Most bytes, on a device with much memory more, of what is kept between chunks of frames: the surface on CUDA, and the visibility of the
 captured lights. For larger pictures they are made again."""
@@ -74,7 +77,8 @@ class SurfaceModel:
         normal = maps.normal.reshape(-1, 3)
         whole = maps.mask.reshape(-1) & np.isfinite(maps.height).reshape(-1) & (np.abs(normal).sum(axis=1) > 0)
         pixels = np.flatnonzero(whole if chosen is None else whole & chosen.reshape(-1))
-        self.pixels = _by_normal(pixels, normal) if by_normal else pixels
+        self._batch_pixels = BATCH_PIXELS if device == "cpu" else CUDA_BATCH_PIXELS
+        self.pixels = _by_normal(pixels, normal, self._batch_pixels) if by_normal else pixels
         """[n] Row-major positions of the solved pixels that will be lit."""
         if not len(self.pixels):
             raise ResultError(f"{where}: no pixel is solved")
@@ -107,8 +111,8 @@ class SurfaceModel:
     def _made(self) -> Iterator[ModelBatch]:
         maps = self.maps
         assert maps.normal is not None and maps.diffuse_albedo is not None
-        for start in range(0, len(self.pixels), BATCH_PIXELS):
-            pixels = self.pixels[start : start + BATCH_PIXELS]
+        for start in range(0, len(self.pixels), self._batch_pixels):
+            pixels = self.pixels[start : start + self._batch_pixels]
 
             def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
                 return values.reshape(maps.mask.size, -1)[pixels].astype(np.float32, copy=False)
@@ -126,7 +130,7 @@ class SurfaceModel:
                 second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
             yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
                                                     self.places(pixels), second=second,
-                                                    profile=None if self.profile is None else self.profile[start : start + BATCH_PIXELS],
+                                                    profile=None if self.profile is None else self.profile[start : start + len(pixels)],
                                                     device=self.device))
 
     def places(self, pixels: np.ndarray) -> np.ndarray:
@@ -167,12 +171,12 @@ class SurfaceModel:
         return height_field(self._height.numpy(), self._mask.numpy() != 0, self._projection, self.device)
 
 
-def _by_normal(pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the pixels [n] of each batch sorted by the cell of their normal, the cells in Morton order: a far light leaves neighbours dark
-    together (service.relight.model_range)."""
+def _by_normal(pixels: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
+    """Return the pixels [n] of each batch of `count` sorted by the cell of their normal, the cells in Morton order: a far light leaves
+    neighbours dark together (service.relight.model_range)."""
     ordered = []
-    for start in range(0, len(pixels), BATCH_PIXELS):
-        batch = pixels[start : start + BATCH_PIXELS]
+    for start in range(0, len(pixels), count):
+        batch = pixels[start : start + count]
         x, y, z = normal[batch].T
         equal_area = np.stack([x, y]) / np.sqrt(np.maximum(1 + z, 1e-3))  # -1…1 where z is 0 or above
         cell = np.clip((equal_area + 1) / 2 * NORMAL_CELLS, 0, NORMAL_CELLS - 1).astype(np.int32)

@@ -69,6 +69,10 @@ class FrameFormat(NamedTuple):
                    tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in options.aov), in_parts(options),
                    None if matte is None else matte.coverage.astype(np.float16), factor, camera_attributes(camera))
 
+    def as_computed(self, files: Sequence["FrameFile"]) -> bool:
+        """Return whether files hold frames as they are computed, but for the range of half."""
+        return self.matrix is None and self.factor is None and not self.parts and all(file.gain == 1.0 for file in files)
+
     def rows(self, first: int, last: int) -> "FrameFormat":
         """Return the format of the rows of frames from `first` until before `last`."""
         width, _ = self.resolution
@@ -126,7 +130,8 @@ class FrameWriter:
         """Wait until the chunk before is written, then begin to write this one.
 
         Args:
-            frames: [frames, 3, pixels] float32 radiance; the writer may change it.
+            frames: [frames, 3, pixels] float32 radiance; the writer may change it. Or half, where the format writes frames as computed, and
+                infinite where they are beyond the range of half.
             colours: further layers of radiance by name, each [frames, 3, pixels] float32, which the writer may change; where `form` has
                 parts, `specular` is among them.
 
@@ -217,7 +222,8 @@ class FrameWriter:
 
 def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int]:
     """Return what the file of a frame holds, of the whole frame or of rows, and the number of clipped pixels."""
-    frame = _finished(frame, file, form)
+    if frame.dtype != np.float16:
+        frame = _finished(frame, file, form)
     bounded = _bounded(frame)
     clipped = 0 if bounded is frame else int((bounded != frame).any(axis=0).sum())
     picture = _half(bounded, form, "")
@@ -247,7 +253,7 @@ def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarr
 
 def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.ndarray]:
     """Return the channels as half."""
-    planes = to_half(frame).reshape(3, form.resolution[1], form.resolution[0])
+    planes = (frame if frame.dtype == np.float16 else to_half(frame)).reshape(3, form.resolution[1], form.resolution[0])
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}
 
 

@@ -100,21 +100,24 @@ def _moments_kernel(pack: int) -> Any:
         albedo_r = load(images.surface, 3, p)
         albedo_g = load(images.surface, 4, p)
         albedo_b = load(images.surface, 5, p)
+        albedo = albedo_r + albedo_g + albedo_b
         sums = sums_type()
         for light in range(images.places.shape[0]):
-            facing, gloss, _, peak = evaluate(images.surface, p, images.places[light], wp.vec4())
             factor = images.factors[light]
             red = load_half(images.stored, light, p)
             green = load_half(images.stored, images.padded + light, p)
             blue = load_half(images.stored, 2 * images.padded + light, p)
+            reading = lane_type()
+            for k in range(pack):
+                reading[k] = (factor[0] * float(red[k]) + factor[1] * float(green[k]) + factor[2] * float(blue[k])) / 3.0
+            facing, gloss, _, peak = evaluate(images.surface, p, images.places[light], wp.vec4())
             bits = load_byte(images.clipped, light / 8, p)
             lit = load_byte(images.visible, light, p)
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / (3.0 * 255.0))
                 shine = seen * (gloss[0, k] + gloss[1, k] + gloss[2, k])
-                reading = (factor[0] * float(red[k]) + factor[1] * float(green[k]) + factor[2] * float(blue[k])) / 3.0
-                matt = seen * (albedo_r[k] + albedo_g[k] + albedo_b[k]) * INVERSE_PI * facing[k]
-                rest = reading - matt - shine
+                matt = seen * albedo[k] * INVERSE_PI * facing[k]
+                rest = reading[k] - matt - shine
                 counts = wp.where(facing[k] < LEAST_FACING or (bit_of(bits[k], light) == 1 and rest < 0.0), 0.0, 1.0)
                 rest = counts * rest
                 shine = counts * shine

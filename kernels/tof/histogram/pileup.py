@@ -7,6 +7,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.packs import take_columns
 
 LEFT_OVER = 0.5
 """Number of pulses that count as left after a bin that took them all: the logarithm of zero is not finite, and dropping the bin would move
@@ -23,9 +24,18 @@ class LiveCounts(NamedTuple):
     live: wp.array  # float32, 0…1: fraction of the pulses without an earlier photon
     pulses: float = np.inf  # of each histogram; finite where a pulse counts one photon at most: counts are binomial then, else Poisson
 
+    def of(self, pixels: np.ndarray) -> "LiveCounts":
+        """Return the histograms of some pixels [n], copied on the device; not synchronised on CUDA."""
+        device = str(self.counts.device)
+        columns = wp.array(pixels, dtype=wp.int32, device=device)
+        taken = [wp.empty((array.shape[0], len(pixels)), dtype=wp.float32, device=device) for array in (self.counts, self.live)]
+        for array, some in zip((self.counts, self.live), taken, strict=True):
+            take_columns(array, columns, 0, some)
+        return LiveCounts(*taken, self.pulses)
 
-def place(counts: np.ndarray, device: str) -> wp.array:
-    """Return histograms [pixel, bin] on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
+
+def checked(counts: np.ndarray) -> np.ndarray:
+    """Return histograms [pixel, bin] as contiguous float32.
     Raises ArrayError: wrong shape, negative or not finite counts, or not one count in all of them."""
     if counts.ndim != 2 or counts.shape[1] < 3:
         raise ArrayError(f"histograms are {counts.shape}: give [pixel, bin] with three bins or more")
@@ -34,6 +44,13 @@ def place(counts: np.ndarray, device: str) -> wp.array:
         raise ArrayError("histograms hold counts that are negative or not finite: give photons")
     if not values.any():
         raise ArrayError("every histogram is empty: no photon was counted")
+    return values
+
+
+def place(counts: np.ndarray, device: str) -> wp.array:
+    """Return histograms [pixel, bin] on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
+    Raises ArrayError: as `checked`."""
+    values = checked(counts)
     if device == "cpu":  # a thread is one pixel after another: its bins stay together
         return wp.array(values, dtype=wp.float32, device=device).transpose()
     return wp.array(values.T, dtype=wp.float32, device=device)

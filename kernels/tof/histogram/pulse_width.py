@@ -5,7 +5,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.tof.histogram.pileup import LiveCounts
@@ -64,7 +63,7 @@ def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
         Neyman, Scott, "Consistent estimates based on partially consistent observations", Econometrica 16(1), 1948.
     """
     chosen = brightest(counts)[:WIDTH_PIXELS]
-    some = subset(histograms, chosen)
+    some = histograms.of(chosen)
     totals = [_evidence(some, gaussian(float(width))) for width in WIDTHS]
     best = int(np.argmax(totals))
     if not np.isfinite(totals[best]):
@@ -74,7 +73,7 @@ def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
         before, here, after = totals[best - 1 : best + 2]
         place = 0.5 * (before - after) / (before - 2 * here + after)  # of the parabola through the three
     sigma = float(WIDTHS[best] * (WIDTHS[1] / WIDTHS[0]) ** place)
-    few = subset(histograms, chosen[:TAIL_PIXELS])
+    few = histograms.of(chosen[:TAIL_PIXELS])
     return _tailed(lambda pulse: _evidence(few, pulse), sigma, longest=TAIL_SPAN * counts.shape[1])
 
 
@@ -84,13 +83,6 @@ def brightest(counts: np.ndarray) -> np.ndarray:
     window = min(WIDTH_WINDOW, counts.shape[1] - 1)
     peak = (total[:, window:] - total[:, :-window]).max(axis=1) - window * np.median(counts, axis=1)
     return np.argsort(-peak, kind="stable")
-
-
-def subset(histograms: LiveCounts, pixels: np.ndarray) -> LiveCounts:
-    """Return the histograms of these pixels."""
-    device = str(histograms.counts.device)
-    return LiveCounts(*(wp.array(array.numpy()[:, pixels], dtype=wp.float32, device=device)
-                        for array in (histograms.counts, histograms.live)), histograms.pulses)
 
 
 def _evidence(some: LiveCounts, pulse: Pulse) -> float:

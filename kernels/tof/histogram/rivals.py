@@ -71,8 +71,7 @@ def vote_on_returns(histograms: LiveCounts, pulse: Pulse, found: Returns, rows: 
     likely[:, ~usable], none[~usable] = 0, 0
     if len(open_ones) == 0:
         return Voted(position, sigma, photons, confidence, np.zeros(pixels, dtype=bool), none)
-    some = LiveCounts(*(wp.array(array.numpy()[:, open_ones], dtype=wp.float32, device=device)
-                        for array in (histograms.counts, histograms.live)), histograms.pulses)
+    some = histograms.of(open_ones)
     background = wp.array(found.background.numpy()[open_ones], dtype=wp.float32, device=device)
     outputs = [*(wp.zeros((RIVALS, len(open_ones)), dtype=wp.float32, device=device) for _ in range(4)),
                *(wp.zeros(len(open_ones), dtype=wp.float32, device=device) for _ in range(2))]

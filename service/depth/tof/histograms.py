@@ -8,7 +8,7 @@ import warp as wp
 
 from kernels.status import SOLVED, Status
 from kernels.tof.histogram.misfit import misfit
-from kernels.tof.histogram.pileup import LiveCounts, correct_pileup, place, without_pileup
+from kernels.tof.histogram.pileup import LiveCounts, checked, correct_pileup, place, without_pileup
 from kernels.tof.histogram.pulse import Pulse, gaussian, measured
 from kernels.tof.histogram.pulse_width import PulseShape, estimate_pulse
 from kernels.tof.histogram.returns import Returns, find_returns
@@ -155,7 +155,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     if not max(nearest, start_m) < min(farthest, end_m):
         raise RequestError(f"ranges from {nearest:g} to {farthest:g} m lie outside the histogram, "
                            f"which covers {start_m:.4g} to {end_m:.4g} m")
-    place(frames.counts, device)  # faults of the counts come before those of what is estimated from them
+    checked(frames.counts)  # faults of the counts come before those of what is estimated from them
     rows, cols = usable.shape
     usable = usable.reshape(-1)
     pattern = pattern_bins(frames.counts[usable])

@@ -15,7 +15,7 @@ from kernels.photometric.lambertian.readings import Lights, pad_lights
 from kernels.photometric.model.samples import evenly, readings_of
 from kernels.photometric.shadows.shadow_evidence import shadow_odds
 from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
-from kernels.surface.shadows import Projection
+from kernels.surface.shadows import Projection, extent_of
 from kernels.surface.slopes import STEEPEST
 from service.solve.base.batches import View, pick_pixels, view_directions
 from service.solve.base.solution import Solution, SolveInput
@@ -216,9 +216,11 @@ class _Scene:
         there = [number, *against]
         parts = wp.array(np.where(np.isin(self._thin_part, there), self._thin_part, -1), dtype=wp.int32, device=self._device)
         odds = np.where(np.isin(self._on, there)[:, None], self._odds, 0)
-        height = wp.array(np.ascontiguousarray(self._height[self._thin], dtype=np.float32), dtype=float, device=self._device)
+        thinned = np.ascontiguousarray(self._height[self._thin], dtype=np.float32)
+        height = wp.array(thinned, dtype=float, device=self._device)
         thickness = wp.array(self._thickness.astype(np.float32), dtype=float, device=self._device)
-        shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, self._projection)
+        box = extent_of(thinned, self._thin_part == number).box
+        shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, box, self._projection)
         evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self.size, blur=self._blur)
         return choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
 

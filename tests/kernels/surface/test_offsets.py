@@ -7,7 +7,7 @@ import warp as wp
 from kernels.errors import ArrayError
 from kernels.photometric.shadows.shadow_evidence import LARGEST_ODDS, shadow_odds
 from kernels.surface.offsets import GROUPS, choose_offset, march_part, weigh_offsets
-from kernels.surface.shadows import Projection
+from kernels.surface.shadows import Projection, extent_of
 
 SIDE = 40
 RISE = 9.0
@@ -30,15 +30,31 @@ def lights(count=24):
     return toward / np.linalg.norm(toward, axis=1, keepdims=True)
 
 
-def march(height, part, device, perspective=False, far=0.0, thick=THICK):
+def march(height, part, device, perspective=False, far=0.0, thick=THICK, box=None):
     pixels = np.argwhere(part >= 0)
     scale = far if perspective else 1.0
     projection = Projection(perspective, wp.vec2(scale, scale), wp.vec2(SIDE / 2, SIDE / 2))
+    box = box or extent_of(np.zeros(part.shape), part == 1).box
     found = march_part(wp.array(pixels.astype(np.int32), dtype=wp.vec2i, device=device),
                        wp.array(lights().astype(np.float32), dtype=wp.vec3, device=device),
                        wp.array(height, dtype=float, device=device), wp.array(part, dtype=wp.int32, device=device),
-                       wp.array(np.full_like(height, thick), dtype=float, device=device), 1, projection)
+                       wp.array(np.full_like(height, thick), dtype=float, device=device), 1, box, projection)
     return pixels, found
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_paths_that_pass_by_the_part_are_not_followed(perspective, device):
+    """As if the part filled the picture, where gaps and shadows count: to the last bit."""
+    height, part = block()
+    part[:, 34:], part[:3] = 2, -1
+    height = height + 12 * (part == 2) - 60 * perspective  # a wall throws shadows too, and few lines of sight are parallel
+    short, long = (march(height.astype(np.float32), part, device, perspective, 60.0, box=box)[1]
+                   for box in (None, wp.vec4i(0, 0, SIDE - 1, SIDE - 1)))
+    met = long.highest.numpy() > -1e29
+    assert 0.02 < met.mean() < 0.5 and 0 < short.hidden.numpy()[~met].sum() < long.hidden.numpy()[~met].sum()
+    for one, other in zip(short[:3], long[:3], strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
+    np.testing.assert_array_equal(short.hidden.numpy()[met], long.hidden.numpy()[met])
 
 
 @pytest.mark.parametrize("perspective", [False, True])
