@@ -189,7 +189,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
             exponent=find_exponent(sample, codes.collected, shown, noise, device))
         if bent.exponent != 1.0:
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-            return Checks([*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine), True)
+            return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
     return Checks(said, codes, True)
 
 
