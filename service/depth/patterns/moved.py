@@ -11,7 +11,7 @@ import numpy as np
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.levels import row_of
-from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -32,6 +32,8 @@ class EvenSums(NamedTuple):
     usual: np.ndarray  # [sums] parts of white, less black
     white: int
     black: int
+    full: float
+    """Reading of a channel from which on it may be clipped, whatever the manifest says."""
     everywhere: bool = False
     """True if bits and their inverses differ at more pixels than what moves before a wall would make them."""
 
@@ -57,7 +59,8 @@ class EvenSums(NamedTuple):
                         rows.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
         if not bits:
             return None
-        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black)
+        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black,
+                    FULL_PART * float(sample.values.max(initial=0.0)))
         lit = sample.whole & found.lit(sample.grey, noise)
         if lit.sum() < ENOUGH:
             return None
@@ -80,9 +83,10 @@ class EvenSums(NamedTuple):
         return (sums - grey[self.black]) / white, deviation
 
     def moved(self, sample: Sample, noise: NoiseModel) -> np.ndarray:
-        """Return where surfaces have moved, [pixels] bool; nowhere where a frame is marked as saturated, whose sums say nothing."""
+        """Return where surfaces have moved, [pixels] bool; nowhere where a reading is or may be clipped, whose sums say nothing."""
         grey = sample.grey
         part, deviation = self.parts(grey, noise)
         away = np.abs(part - self.usual[:, None]).max(axis=0)
         found = np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))
+        found &= sample.values.max(axis=(0, 1)) < self.full
         return found if sample.saturated is None else found & ~sample.saturated.any(axis=0)
