@@ -87,8 +87,10 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
     yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), ONE, light)
     yield _run(f"phase {WIDTH}, 3 steps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), ONE, light)
-    for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3)):
-        yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES[name], light)
+    for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3), ("Gray, white and black", 0.45),
+                       (f"phase {WIDTH}, 3 steps", 0.1), (f"phase {WIDTH}, 3 steps", 0.3)):
+        yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES.get(name, ONE),
+                   light)
 
     for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray", "micro"):
         for words, below in BELOW.items():

@@ -2,10 +2,12 @@
 
 A pattern and its inverse add up to even light, and so does a wave over its shifts, whatever is seen and however blurred it is. Where these
 sums differ between the bits of a code, or between the periods of its waves, frames of one pixel do not show one scene under the patterns
-that are declared: the camera has recorded parts of two patterns, or the surface has moved.
+that are declared: the camera has recorded parts of two patterns, or the surface has moved. So do they
+where wide stripes are neither dark nor bright.
 """
 
 from collections.abc import Sequence
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +29,11 @@ CLEAR_BIT = 0.85
 """Least difference of a bit and its inverse, as a part of the largest of the pixel's bits, with which its sum is compared."""
 LIT_SIGMAS = 20.0
 """Least of that largest difference, in deviations of a reading, of pixels that tell whether frames are mixed."""
+BETWEEN, SEVERAL = (0.25, 0.75), 2
+"""Levels between the darkest and the brightest bit of a pixel that no stripe has, and number of frames of a pixel that must have them, of
+its coarse bits, white and black: at the edge of a stripe of a Gray code one bit is between the two, and no other."""
+COARSE = 0.5
+"""Part of the bits, the coarsest, that are looked at: blur and texture do not reach far into their stripes."""
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 
@@ -98,6 +105,20 @@ class EvenLevels(NamedTuple):
         return found
 
 
+def between(grey: np.ndarray, collected: Collected, noise: NoiseModel) -> np.ndarray:
+    """Return where coarse bits of a Gray code without inverses, white and black lie between dark and bright stripes, [pixels] bool."""
+    found = np.zeros(grey.shape[1], bool)
+    for code in collected.codes:
+        if isinstance(code, BinaryCode) and code.name == "gray" and code.inverses is None:
+            bits = grey[list(code.frames)]
+            dark, bright = bits.min(axis=0), bits.max(axis=0)
+            lit = bright - dark > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(bright, 0))
+            even = [grey[number] for number in (collected.white, collected.black) if number is not None]
+            parts = (np.stack([*bits[-ceil(COARSE * len(bits)):], *even]) - dark) / np.maximum(bright - dark, 1e-12)
+            found |= lit & (((parts > BETWEEN[0]) & (parts < BETWEEN[1])).sum(axis=0) >= SEVERAL)
+    return found
+
+
 def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:
     """Return [frames] weights that are 0 elsewhere."""
     row = np.zeros(frames)
@@ -112,10 +133,11 @@ def check_levels(sample: Sample, collected: Collected, projector: PatternProject
     if lit.sum() < ENOUGH:
         return None
     levels = EvenLevels.of(collected, len(grey), projector.response)
-    share = float(levels.mixed(grey[:, lit], noise).mean())
+    share = float((levels.mixed(grey[:, lit], noise) | between(grey[:, lit], collected, noise)).mean())
     if share < MOST_MIXED:
         return None
     unknown = projector.response is None and levels.waves is not None and ((levels.waves != 0).sum(axis=1) == FULL_STEPS).any()
-    return (f"frames: {100 * share:.0f} % of the lit pixels have levels that no pattern has (bits and their inverses, or waves over their "
-            "shifts, do not add up to the same light): the camera has recorded parts of two patterns, or what it sees has moved: wait "
-            f"longer for each pattern, or synchronise projector and camera{UNKNOWN_RESPONSE if unknown else ''}")
+    return (f"frames: {100 * share:.0f} % of the lit pixels have levels that no pattern has (stripes are neither dark nor bright, or bits "
+            "and their inverses, or waves over their shifts, do not add up to the same light): the camera has recorded parts of two "
+            "patterns, or what it sees has moved: wait longer for each pattern, or synchronise projector and camera"
+            f"{UNKNOWN_RESPONSE if unknown else ''}")

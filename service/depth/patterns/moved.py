@@ -11,7 +11,7 @@ import numpy as np
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.levels import row_of
-from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -22,7 +22,7 @@ flicker by less."""
 LIT_SIGMAS = 20.0
 """Least difference of white and black, in deviations of a reading, of pixels that are compared."""
 MOST_MOVED, SAID = 0.2, 0.005
-"""Parts of the compared pixels above which it is no motion but a camera that is not linear, and from which on it is said."""
+"""Parts of the compared pixels above which it is no motion of single things, and from which on it is said."""
 
 
 class EvenSums(NamedTuple):
@@ -32,11 +32,15 @@ class EvenSums(NamedTuple):
     usual: np.ndarray  # [sums] parts of white, less black
     white: int
     black: int
+    full: float
+    """Reading of a channel from which on it may be clipped, whatever the manifest says."""
+    everywhere: bool = False
+    """True if bits and their inverses differ at more pixels than what moves before a wall would make them."""
 
     @classmethod
     def of(cls, sample: Sample, collected: Collected, noise: NoiseModel) -> "EvenSums | None":
-        """Return the sums of a capture that has waves beside bits with inverses, white and black; None of another, or if what differs is
-        more than motion would make."""
+        """Return the sums of a capture that has bits with inverses, white and black, with waves or without; None of another, or if waves
+        differ at more pixels than motion would make: those of a camera that is not linear do, and stripes of it do not."""
         if collected.white is None or collected.black is None:
             return None
         frames = len(sample.values)
@@ -53,15 +57,18 @@ class EvenSums(NamedTuple):
                     if len(members) >= FULL_STEPS:
                         shifts = np.array([code.shifts[index] for index in members])
                         rows.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
-        if not bits or len(rows) == bits:
+        if not bits:
             return None
-        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black)
+        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black,
+                    FULL_PART * float(sample.values.max(initial=0.0)))
         lit = sample.whole & found.lit(sample.grey, noise)
         if lit.sum() < ENOUGH:
             return None
         part, _ = found.parts(sample.grey[:, lit], noise)
         found = found._replace(usual=np.median(part, axis=1))
-        return found if found.moved(sample, noise)[lit].mean() <= MOST_MOVED else None
+        if found.moved(sample, noise)[lit].mean() <= MOST_MOVED:
+            return found
+        return found._replace(everywhere=True) if len(rows) == bits else None
 
     def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return which pixels are compared, of readings [frames, pixels]."""
@@ -76,9 +83,10 @@ class EvenSums(NamedTuple):
         return (sums - grey[self.black]) / white, deviation
 
     def moved(self, sample: Sample, noise: NoiseModel) -> np.ndarray:
-        """Return where surfaces have moved, [pixels] bool; nowhere where a frame is marked as saturated, whose sums say nothing."""
+        """Return where surfaces have moved, [pixels] bool; nowhere where a reading is or may be clipped, whose sums say nothing."""
         grey = sample.grey
         part, deviation = self.parts(grey, noise)
         away = np.abs(part - self.usual[:, None]).max(axis=0)
         found = np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))
+        found &= sample.values.max(axis=(0, 1)) < self.full
         return found if sample.saturated is None else found & ~sample.saturated.any(axis=0)

@@ -114,13 +114,10 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
                                      declared=declared)
-        moved = _moved(planes, mask, capture, codes.collected, noise)
+        moved, said = _moved(planes, mask, capture, codes.collected, noise)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
-    if moved.any():
-        clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
-        warnings.append(f"frames[]: the even light of the frames differs at {100 * moved.sum() / mask.sum():.2g} % of the pixels, as where "
-                        f"something has moved during the sequence{clipped}: they are unsure")
+    warnings += said
     facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
@@ -192,21 +189,32 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
             exponent=find_exponent(sample, codes.collected, shown, noise, device))
         if bent.exponent != 1.0:
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-            return Checks([*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine), True)
+            return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
     return Checks(said, codes, True)
 
 
-def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel) -> np.ndarray:
-    """Return where surfaces have moved between frames, [rows, cols] bool; nowhere if it is too little to tell."""
+def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel) -> tuple[np.ndarray, list[str]]:
+    """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
+    if it is everywhere, where most stripes are read rightly all the same."""
     sample = sample_of(planes, capture.camera, mask)
     sums = EvenSums.of(sample, collected, noise)
     moved = np.zeros(mask.shape, bool)
-    if sums is not None and sums.moved(sample, noise).any():
-        for band in planes.bands(DECODE_BYTES_PER_PIXEL):
-            saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
-            part = sample._replace(values=planes.band(band), saturated=saturated)
-            moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
-    return moved if moved.sum() > SAID * mask.sum() else np.zeros_like(moved)
+    if sums is None or not sums.moved(sample, noise).any():
+        return moved, []
+    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+        saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
+        part = sample._replace(values=planes.band(band), saturated=saturated)
+        moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
+    share = moved.sum() / mask.sum()
+    if share <= SAID:
+        return np.zeros_like(moved), []
+    clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
+    seen = f"frames[]: the even light of the frames differs at {100 * share:.2g} % of the pixels, as where "
+    if sums.everywhere:
+        return np.zeros_like(moved), [f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two "
+                                      f"patterns{clipped}: the standard deviations do not hold what that makes; keep it still, or wait "
+                                      "longer for each pattern"]
+    return moved, [f"{seen}something has moved during the sequence{clipped}: they are unsure"]
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:

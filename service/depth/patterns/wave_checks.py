@@ -5,6 +5,7 @@ declaration; but a surface cannot pass from the last column to the first, order 
 depths lie in front of both. Where these leave another offset as good as the declared one, that is said.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,9 @@ MEDIAN_SQUARE = 0.6
 """Median of the squared misfit over its variance: ln 2 of three periods, 0.45 of two."""
 OFFSETS = ((0.25, "-π/2"), (0.5, "π"), (-0.25, "π/2"))
 """Turns to add to the phases, and the change of offset_rad that this makes."""
+SPAN_STEP, LOOSE = 1 / 72, 0.05
+"""Turns between the offsets of one wave that are tried, and number of turns over which they fit from which on that is said: a fifth of
+another frame in each shifts the wave by that much."""
 
 
 class Waves(NamedTuple):
@@ -224,10 +228,25 @@ def _check_one(waves: Waves, sample: Sample, model: ProjectorModel | None, axis:
         named = f"; changed by {possible[0]} it would not" if len(possible) == 1 else ""
         return (f"{seen}: one wave of {waves.periods[0]:g} px over the projector does not{named}: check offset_rad (a sine has -π/2), step "
                 "and period_px"), None
-    if alone and possible:
-        return None, (f"are one wave, whose offset_rad nothing in the capture confirms: changed by {' or '.join(possible)} it would fit as "
-                      "well, and all depths would be others; add a Gray code, the other axis, or a second period")
-    return None, None
+    if not alone:
+        return None, None
+    low, high = (_last_that_fits(sign, state) for sign in (1, -1))
+    if not possible and low + high < LOOSE:
+        return None, None
+    beyond = [words for change, words in OFFSETS if words in possible and not -high <= change <= low]
+    ways = [f"-{360 * low:.0f}° to +{360 * high:.0f}°", *beyond]
+    return None, (f"are one wave, whose offset_rad nothing in the capture confirms: changed by {' or '.join(ways)} it would fit as "
+                  "well, and all depths would be others, which the standard deviations do not hold; frames that hold part of the next one "
+                  "change it, and so does what moves: add a Gray code, the other axis, or a second period")
+
+
+def _last_that_fits(sign: int, state: Callable[[float], tuple[bool, float]]) -> float:
+    """Return by how many turns a wave can be shifted in one direction before surfaces cross the projector's border, or lie behind it."""
+    for count in range(1, round(0.5 / SPAN_STEP) + 1):
+        crossing, part = state(sign * count * SPAN_STEP)
+        if crossing or part > POSSIBLE:
+            return (count - 1) * SPAN_STEP
+    return 0.5
 
 
 def _order(turns: np.ndarray, clear: np.ndarray, sample: Sample, model: ProjectorModel | None, axis: int) -> float | None:

@@ -4,9 +4,16 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
+from kernels.structured.pattern_frames import NoiseModel
 from service.depth.depth import depth
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.levels import check_levels
+from service.depth.patterns.pattern_checks import Sample
 from service.requests.depth import DepthRequest
+from stage.patterns.binary import binary_patterns
+from stage.patterns.codes import collect
 from tests.scenes.captures import write_exr, write_image
 from tests.scenes.depth import AMBIENT, gray_patterns, make_scene, manifest, phase_patterns, shown
 
@@ -79,3 +86,30 @@ def test_frames_that_are_clipped_are_not_called_mixed(tmp_path, scene):
     (tmp_path / "capture.json").write_text(json.dumps(manifest(frames, color_space="lin_rec709_scene")))
     result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
     assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
+
+
+def stripes_said(*, part=0.0, blur_px=0.6, gamma=1.0, dimmed_white=1.0):
+    """What is said of a Gray code with white and black, without inverses: a wall with a step and a texture, seen by 24 rows."""
+    rng, patterns = np.random.default_rng(5), binary_patterns(320, "column", inverses=False)
+    x = np.arange(180) + 0.2 * np.arange(24)[:, None]
+    u = 12 + 1.6 * x - 20 * (x > 100)
+    albedo = 0.5 + 0.3 * np.sin(0.5 * x) * np.cos(0.9 * np.arange(24)[:, None])
+    light = np.stack([pattern.level(u, u, 320) for pattern in patterns]) ** gamma
+    light[[pattern.code == "white" for pattern in patterns]] *= dimmed_white
+    light = gaussian_filter1d((1 - part) * light + part * np.roll(light, -1, axis=0), blur_px, axis=2)
+    frames = albedo * (0.7 * light + 0.04)
+    frames = (frames + rng.normal(0, NOISE, frames.shape)).astype(np.float32)
+    empty = np.zeros(x.shape, np.float32)
+    sample = Sample(frames.reshape(len(frames), 1, -1), None, empty, empty, np.ones(x.shape, bool))
+    return check_levels(sample, collect(patterns), PatternProjector((320, 240)), NoiseModel(NOISE, 0.0))
+
+
+@pytest.mark.parametrize("part", [0.3, 0.45, 0.5, 0.6])
+def test_stripes_of_mixed_frames_are_neither_dark_nor_bright(part):
+    assert "levels that no pattern has" in (stripes_said(part=part) or "")
+
+
+@pytest.mark.parametrize("scene", [{}, {"blur_px": 4.0}, {"gamma": 2.2}, {"gamma": 0.5}, {"dimmed_white": 0.6}],
+                         ids=["sharp", "out of focus", "gamma", "inverse gamma", "a display that dims white"])
+def test_stripes_of_whole_frames_raise_no_doubt(scene):
+    assert stripes_said(**scene) is None
