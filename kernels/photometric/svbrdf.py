@@ -39,6 +39,7 @@ from kernels.photometric.search.descent import WARM, descend
 from kernels.photometric.search.hypotheses import Diffuse, Prior
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.refine import refine
+from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A
@@ -60,7 +61,6 @@ class SvbrdfFit(NamedTuple):
     specular: np.ndarray  # [n, 3] float32, F0
     roughness: np.ndarray  # [n] float32
     sigma: np.ndarray  # [n] float32, standard deviation of the normal, degrees
-    unseen: np.ndarray  # [n] float32: the part of it, in quadrature, that stands for errors of neighbours until their surface shows them
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
     mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
@@ -68,7 +68,7 @@ class SvbrdfFit(NamedTuple):
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: Diffuse | None = None,
                  shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
-                 beside: np.ndarray | None = None) -> SvbrdfFit:
+                 beside: np.ndarray | None = None, shared_misfit: float = UNKNOWN_SHARE) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels; waits for the device.
 
     Args:
@@ -82,6 +82,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
             prior, is left out, and the surface is taken as Lambertian.
         beside: [steps, n] of normal_search.neighbours; None: no pixel is another's neighbour.
+        shared_misfit: share of the misfit that neighbouring pixels have in common, of shared_misfit.shared_misfit.
     """
     lobe = shape if lobe is None else lobe
     found = find_normals(samples, start, shape=shape, beside=beside, prior=prior)
@@ -118,8 +119,8 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
     material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
         spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
-    sigma, unseen = standard_deviation(samples, found, normal, spread, lone)
-    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma, unseen,
+    sigma = standard_deviation(samples, found, normal, spread, lone, shared_misfit)
+    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma,
                      np.sqrt(found.best.cost), mixture)
 
 

@@ -23,6 +23,10 @@ CHECK_EVERY = 4
 """Number of iterations between two readings of the residual on CUDA, where each reading waits for the device. It is even, so that their
 graph ends in the slot in which it begins."""
 
+NEAR, GROWN = 10.0, 1.0e4
+"""Squared residual, over that of the goal, at which a solve ends once it falls no more, and over its least at which it ends wherever that
+is: in float32 it may stay just above the goal, and iterations that go on divide rounding errors until the heights are nothing else."""
+
 
 class Convergence(NamedTuple):
     """The end of a solve."""
@@ -147,13 +151,13 @@ class Solver:
         tolerance: float,  # relative; close to the relative error of the slopes of h in the weighted norm
         progress: Callable[[float], None] | None = None,  # told the fraction done, by the logarithm of the residual
     ) -> Convergence:
-        """Improve h until the preconditioned residual norm is below tolerance times its first value.
+        """Improve h until the preconditioned residual norm is below tolerance times its first value, or near it and falls no more.
         Returns how the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA."""
         grid, every = self.grid, CHECK_EVERY if self.grid.device != "cpu" or devices.has_graphs("cpu") else 1
         run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)
         wp.copy(self.p, self.z)
-        start = square = self._square(0)
+        start = square = least = self._square(0)
         goal, step = (tolerance * math.sqrt(start)) ** 2, 0
         group = devices.Repeated(lambda: self._iterate(h, goal, range(step, step + every)), grid.device)
         while square > goal and step < self.max_iterations:
@@ -163,10 +167,13 @@ class Solver:
                 every = self.max_iterations - step
                 self._iterate(h, goal, range(step, self.max_iterations))
             step += every
-            square = self._square(step % 2)
+            square, least = self._square(step % 2), min(least, square)
+            if square > least * (1 if least <= NEAR * goal else GROWN):
+                break
             if progress is not None and square > 0.0:
                 progress(min(1.0, math.log(start / square) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
-        return Convergence(step, math.sqrt(square) / math.sqrt(start) if start > 0.0 else 0.0, square <= goal)
+        least = min(least, square)
+        return Convergence(step, math.sqrt(least) / math.sqrt(start) if start > 0.0 else 0.0, least <= NEAR * goal)
 
     def _iterate(self, h: wp.array, goal: float, steps: range) -> None:
         """Do these steps; those after the goal is reached change nothing."""

@@ -117,7 +117,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if placement is not None:
         solution.height = placement.height
         solution.warnings += placement.warnings()
-    if solution.unseen is not None and solution.height is not None:
+    if solution.shared_misfit is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)
     if request.materials is Materials.COHERENT:
         agree_on_materials(solution, sigma, shape, given.device)
@@ -175,13 +175,13 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
 
 
 def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera) -> None:
-    """Replace what stands in σ for errors that neighbours share by what the surface shows of them."""
-    assert solution.unseen is not None and solution.height is not None
+    """Add to σ what the surface shows of errors that neighbours share."""
+    assert solution.shared_misfit is not None and solution.height is not None
     shape, found = estimated.shape, _part_numbers(solution)
     part = np.where(estimated, 1 if found is None else found, 0)
     normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
-    own = np.sqrt(np.maximum(solution.standard_error() ** 2 - solution.unseen.astype(np.float32) ** 2, 0))
-    shown = np.hypot(own.reshape(shape), integrability.doubt(normal, solution.height, part, camera))
+    shown = np.hypot(solution.standard_error().reshape(shape),
+                     integrability.doubt(normal, solution.height, part, camera, shared=solution.shared_misfit))
     sigma = integrability.beside_parts(shown, part).reshape(-1)
     solution.sigma = np.where(np.isin(solution.status, ESTIMATED), sigma, solution.sigma).astype(np.float16)
 

@@ -28,18 +28,12 @@ from kernels.photometric.search.survey import Survey, evidence, noise_of
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
-CAMERA_COST = 0.01
-"""Cost of a reading that the noise of a camera explains, 1 % of it; misfit beyond is that of the model."""
-UNAVERAGED = 1 / 8
-"""Part of the variance of one reading's misfit that remains however many lights there are, because the misfit of neighbouring lights is
-alike."""
+UNAVERAGED = 0.6
+"""Part of the variance of a reading's misfit that remains however many lights there are, for each share of it that neighbouring pixels have
+in common: what pixels share, neighbouring lights share too. Measured, as the numbers below, on path-traced scenes and real objects."""
 FREE = 0.4
 """Part of the variance by the curvature of the mixture, and of the squared spread of models averaged, that errors have: lobes that are free
 let a normal go further than the truth does, and a mean errs less than what it is the mean of."""
-OWN = 0.3
-"""Part of the variance by the curvature that a pixel has for itself where its mode is sharp: the rest stands for misfit that neighbours
-share, until their surface shows how much there is. It rises to 1 where the mode is as flat as counts, because readings that leave a normal
-open do so however well they fit. Measured on path-traced scenes and real objects."""
 SOFTNESS = 0.2
 """Part of the whole cost by which costs of candidates may differ through misfit of the model alone."""
 BREAKDOWN = 0.5
@@ -55,13 +49,6 @@ UNDESCRIBED = 0.9
 """Logarithm of the factor on the standard deviation where half of the readings contradict the normal."""
 
 
-class Deviation(NamedTuple):
-    """How sure a normal is."""
-
-    sigma: np.ndarray  # [n] float32, standard deviation in degrees
-    unseen: np.ndarray  # [n] float32: the part of it, in quadrature, that stands for errors of neighbours until their surface shows them
-
-
 class SingleLobe(NamedTuple):
     """The joint fit of a single lobe, where it takes part in the average of a pixel's normals; [n] each."""
 
@@ -70,23 +57,23 @@ class SingleLobe(NamedTuple):
     openness: np.ndarray  # variance of its normal per unit of noise, squared radians
 
 
-def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, single: SingleLobe | None) -> Deviation:
-    """Return the standard deviation of the normals of a search; waits for the device.
+def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, single: SingleLobe | None,
+                       shared: float) -> np.ndarray:
+    """Return the standard deviation of the normals of a search in degrees, [n] float32; waits for the device.
     `normal`: [n, 3] unit, the result, which may be an average of several searches. `spread`: [n] of that average, degrees. `single`: the
-    single lobe, whose curvature and noise count by its weight; None: it takes no part."""
+    single lobe, whose curvature and noise count by its weight; None: it takes no part. `shared`: 0…1, of `shared_misfit`."""
     lights = samples.light_count
     total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)
     mean = lights * np.maximum(found.best.curvature.astype(np.float64), 1e-12)
     swing = np.minimum(lights * found.best.swing, (1 - LEAST_RISE) * mean)
-    mixed, around = np.ones(len(normal)), FREE * _around(2 * mean / (mean**2 - swing**2), noise, lights)
+    alike = 1 + UNAVERAGED * lights * shared
+    mixed, around = np.ones(len(normal)), FREE * _around(2 * mean / (mean**2 - swing**2), noise, alike)
     if single is not None:
         mixed = 1 - single.weight.astype(np.float64)
         alone = noise_of(lights * single.cost.astype(np.float64), surplus)
-        around = mixed * around + single.weight * _around(single.openness.astype(np.float64), alone, lights)
+        around = mixed * around + single.weight * _around(single.openness.astype(np.float64), alone, alike)
         noise = mixed * noise + single.weight * alone
-    averaged = FREE * spread.astype(np.float64) ** 2
-    own_part = OWN + (1 - OWN) * np.minimum(around / (FREE * FLATTEST**2), 1)
-    variance, own = (np.minimum(part * around + averaged, FLATTEST**2) for part in (1, own_part))
+    variance = np.minimum(around + FREE * spread.astype(np.float64) ** 2, FLATTEST**2)
     apart = np.maximum(APART_DEGREES, APART_SIGMAS * np.sqrt(variance))
     softness = 2 * noise + SOFTNESS * total
     judged = np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1)
@@ -95,15 +82,14 @@ def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, sprea
     elsewhere = mixed * there / (here + there) * np.sqrt(moment / np.maximum(there, 1e-20))
     unchecked = (surplus + 2) / (surplus + 1)
     undescribed = np.exp(UNDESCRIBED * np.minimum(noise / BREAKDOWN, 1) ** 2)
-    other = np.minimum(elsewhere, MOST_ELSEWHERE) ** 2
-    sigma, seen = (np.minimum(unchecked * undescribed * np.sqrt(part + other), MOST) for part in (variance, own))
-    return Deviation(sigma.astype(np.float32), np.sqrt(np.maximum(sigma**2 - seen**2, 0)).astype(np.float32))
+    sigma = unchecked * undescribed * np.hypot(np.sqrt(variance), np.minimum(elsewhere, MOST_ELSEWHERE))
+    return np.asarray(np.minimum(sigma, MOST), dtype=np.float32)
 
 
-def _around(openness: np.ndarray, noise: np.ndarray, lights: int) -> np.ndarray:
-    """Return the variance about a mode, [n] squared degrees, of a normal whose variance per unit of noise is given in squared radians."""
-    unaveraged = UNAVERAGED * lights * np.clip(1 - CAMERA_COST / noise, 0, 1)
-    return np.asarray(np.minimum(np.degrees(1.0) ** 2 * openness * noise, FLATTEST**2) * (1 + unaveraged))
+def _around(openness: np.ndarray, noise: np.ndarray, alike: float) -> np.ndarray:
+    """Return the variance about a mode, [n] squared degrees, of a normal whose variance per unit of noise is given in squared radians.
+    `alike`: how much more of it misfit that lights share causes than independent noise."""
+    return np.asarray(np.minimum(np.degrees(1.0) ** 2 * openness * noise, FLATTEST**2) * alike)
 
 
 def _masses(surveyed: Survey | None, normal: np.ndarray, judged: np.ndarray) -> np.ndarray:

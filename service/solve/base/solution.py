@@ -100,8 +100,8 @@ class Solution:
     integration: Integration | None = None
     """The last integration of the normals, from which the height came."""
     suspects: list[SuspectLight] = field(default_factory=list)
-    unseen: np.ndarray | None = None  # [pixels] float16, degrees
-    """The part of sigma, in quadrature, that stands for errors of neighbours until their surface shows them; None: no surface judges."""
+    shared_misfit: float | None = None
+    """Share of the misfit that neighbouring pixels have in common, by which the surface judges sigma; None: no surface judges."""
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)

@@ -13,18 +13,19 @@ algorithms", TPAMI 1988; as a measure of their error it is ours.
 import numpy as np
 
 from kernels.photometric.search.certainty import MOST
+from kernels.surface.slopes import STEEPEST
 from stage.capture.camera import Camera
 
-REACH = 4.0
-"""Standard deviation, in pixels, of the window over which the misfit is pooled: fewer pixels leave the pooled value to chance."""
+REACH = 2.0
+"""Standard deviation, in pixels, of the window over which the misfit is pooled: fewer pixels leave the pooled value to chance, more of them
+lend the errors of some to others."""
 REACHES = 3
 """Standard deviations at which the window ends."""
-BAND_PIXELS = 1 << 20
+BAND_PIXELS = 1 << 19
 """Number of pixels that are looked at in one piece: it bounds the memory."""
-ROOT_OF_MEAN = 1.9
-"""Standard deviation of errors over the mean misfit: 1.6 for those without preferred direction, because the mean of a Rayleigh distribution
-is 0.886 of its root mean square, and half of the variance of the errors is of a gradient and unseen; errors that neighbours share are more
-of a gradient than that."""
+BENT = 7.0
+"""Standard deviation of normals over their mean misfit, less 1, for each share of the residuals that neighbouring pixels have in common:
+errors that neighbours share bend a surface, and are mostly those of another surface. Measured on path-traced scenes and real objects."""
 LEAST_COUNT = 1e-4
 """Least weight of all pixels around one at which their misfit is looked at."""
 STEEP = np.radians(3.0)
@@ -32,9 +33,6 @@ STEEP = np.radians(3.0)
 LARGEST_TRACE = 5.0
 """Standard deviation, in degrees, that the misfit tends to where it is large: there it is of a texture of many degrees from pixel to pixel
 more than of errors."""
-SHARED, NOISE = 1.9, 0.3
-"""Standard deviation over a large misfit, and the misfit, in degrees, that counts half of that: small ones are of noise, which each pixel's
-own readings tell, and of differences of heights on a curve; large ones of errors that neighbours share, of which most is a gradient."""
 PIXEL = 0.03
 """Standard deviation, in degrees, of the surest normals: those of the piece of surface that a pixel sees differ."""
 MIXED, MIXED_DEGREES = 2.0, 2.0
@@ -42,12 +40,12 @@ MIXED, MIXED_DEGREES = 2.0, 2.0
 parts, and its readings tell that only partly. On path-traced scenes a tenth of these pixels are more than 10° to 30° off."""
 
 
-def doubt(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
+def doubt(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Camera, *, shared: float) -> np.ndarray:
     """Return the standard deviation of normals, in degrees, that their misfit to a surface shows, [rows, cols] float32.
     `normal`: [rows, cols, 3] unit. `height`: [rows, cols] camera-frame z, integrated from them. `part`: [rows, cols] int, the number of
-    the part of each pixel that has both, from 1; 0 elsewhere. No surface leads from part to part."""
-    found = misfit(normal, height, part, camera)
-    found *= SHARED * found / (found + NOISE)
+    the part of each pixel that has both, from 1; 0 elsewhere. No surface leads from part to part. `shared`: 0…1, share of the residuals
+    of the readings that neighbouring pixels have in common."""
+    found = (1 + BENT * shared) * misfit(normal, height, part, camera)
     return np.hypot(found / np.hypot(1, found / LARGEST_TRACE), PIXEL)
 
 
@@ -61,33 +59,48 @@ def beside_parts(sigma: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def misfit(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the standard deviation, in degrees, of which the misfit of normals to a surface would be the trace, [rows, cols] float32; 0
-    where too few neighbours are solved to say. Parameters are as for `doubt`."""
+    """Return the mean angle, in degrees, from normals to those of the surface around each pixel, [rows, cols] float32; 0 where too few
+    neighbours are solved to say. Parameters are as for `doubt`."""
     found, reach = np.empty(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
     step = max(1, BAND_PIXELS // height.shape[1])
     for first in range(0, len(height), step):
         above = max(first - reach, 0)
         band = slice(above, first + step + reach)
-        points = camera.points(height[band], above).astype(np.float64)
-        found[first : first + step] = _misfit_of_rows(normal[band], points, part[band])[first - above :][:step]
+        points, sight = (camera.points(z, above).astype(np.float64) for z in (height[band], np.ones_like(height[band])))
+        if camera.projection == "orthographic":
+            sight[..., :2] = 0
+        found[first : first + step] = _misfit_of_rows(normal[band].astype(np.float64), points, sight, part[band])[first - above :][:step]
     return found
 
 
-def _misfit_of_rows(normal: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Return `misfit` of some rows, from camera-frame points; all but the outermost REACHES · REACH + 1 are those of the whole image."""
-    right, left, above, below = _sides(points)
+def _misfit_of_rows(normal: np.ndarray, points: np.ndarray, sight: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return `misfit` of some rows, from camera-frame points; all but the outermost REACHES · REACH + 1 are those of the whole image.
+    `sight`: [rows, cols, 3] change of the points for each unit of height."""
     inside = part > 0
     for side in _sides(part[..., None]):
         inside &= side[..., 0] == part
-    surface = _unit(np.cross(right - left, above - below))
-    given = normal.astype(np.float64)
-    sides = _sides(given)
-    around = _unit(4 * given + sum(sides))  # over the pixels that the differences of heights span
-    angle = np.arccos(np.clip((surface * around).sum(axis=-1), -1, 1))
-    turn = (((sides[0] - sides[1]) ** 2).sum(axis=-1) + ((sides[2] - sides[3]) ** 2).sum(axis=-1)) / 4
+    middle = (normal, points, sight)
+    right, left, above, below = zip(*(_sides(values) for values in middle), strict=True)
+    steps, planes = [], []
+    for one, other in ((right, left), (above, below)):
+        steps.append(one[1] - other[1])
+        planes.append(steps[-1] - (_excess(middle, one) - _excess(middle, other))[..., None] * sight)
+    surface, given = (_unit(np.cross(*two)) for two in (steps, planes))
+    angle = np.degrees(np.arccos(np.clip((surface * given).sum(axis=-1), -1, 1)))
+    turn = (((right[0] - left[0]) ** 2).sum(axis=-1) + ((above[0] - below[0]) ** 2).sum(axis=-1)) / 4
     weight = inside / (1 + turn / STEEP**2)
     pooled, count = _pool(weight * angle), _pool(weight)
-    return (ROOT_OF_MEAN * np.degrees(np.divide(pooled, count, out=np.zeros_like(pooled), where=count > LEAST_COUNT))).astype(np.float32)
+    return np.divide(pooled, count, out=np.zeros_like(pooled), where=count > LEAST_COUNT).astype(np.float32)
+
+
+def _excess(here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return how much farther, in height, the surface steps from one pixel to another than the mean slope of both normals says.
+    `here`, `there`: normal, point and sight of both, [rows, cols, 3]. This is the residual of the integration: differences over two pixels
+    against the normal between them would show a curve for an error."""
+    (n, point, sight), (other_n, other_point, other_sight) = here, there
+    step = other_point - point
+    return np.asarray(0.5 * sum((a * step).sum(axis=-1) / np.maximum((a * b).sum(axis=-1), STEEPEST)
+                                for a, b in ((n, other_sight), (other_n, sight))))
 
 
 def _sides(values: np.ndarray) -> list[np.ndarray]:

@@ -52,12 +52,9 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
 def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Misfit:
     """Return the misfit of an object, from fits to pairs of its pixels.
     `fit_normals`: `solve_lambert` or `solve_robust`, which fits the normals of a band."""
-    first = np.zeros(given.mask.shape, dtype=bool)
-    first[:, :-APART] = given.mask[:, :-APART] & given.mask[:, APART:]
-    start = np.flatnonzero(first)
+    start = pair_starts(given.mask, PAIRS)
     if not len(start):
         return Misfit()
-    start = start[evenly(len(start), PAIRS)]
     pixels = np.concatenate([start, start + APART])
     band = given.images[given.device].pick(pixels)
     readings = grey_readings(band, grey_factors(lights, GREY_WEIGHTS))
@@ -77,3 +74,11 @@ def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = 
 
     return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(fit.normal.numpy()),
                                    pairs(fit.squares.numpy()), pairs(fit.freedom.numpy())))
+
+
+def pair_starts(mask: np.ndarray, most: int) -> np.ndarray:
+    """Return the positions of the first pixels of up to `most` pairs, spread over a mask, [rows, cols] bool; the second lies APART on."""
+    first = np.zeros(mask.shape, dtype=bool)
+    first[:, :-APART] = mask[:, :-APART] & mask[:, APART:]
+    start = np.flatnonzero(first)
+    return start[evenly(len(start), most)] if len(start) else start

@@ -20,10 +20,12 @@ from kernels.photometric.material.mixtures import HELD, NO_PAIRS, choose_pairs
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import Samples, evenly
+from kernels.photometric.search.descent import descend
 from kernels.photometric.search.diffuse_shape import choose_diffuse
 from kernels.photometric.search.hypotheses import Diffuse, Prior
 from kernels.photometric.search.light_factors import find_light_factors
 from kernels.photometric.search.normal_search import find_normals, neighbours
+from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfit
 from kernels.photometric.search.survey import QUICK
 from kernels.photometric.shadows.bounce import bounce_albedo
 from kernels.photometric.svbrdf import solve_svbrdf
@@ -33,6 +35,7 @@ from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, p
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.parts import Material
+from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.settling import settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
 from stage.colour.colour import GREY_WEIGHTS
@@ -41,6 +44,8 @@ SPREAD_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
 MATERIAL_PIXELS = 640
 """Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
+SHARED_PAIRS = 384
+"""Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
 PRIOR_STRENGTH = 10.0
@@ -239,8 +244,9 @@ class _Walk:
         count = self._given.stack.pixel_count
         sigma = self.result.sigma
         sigma[:] = LARGEST_ERROR
-        abundance, pair, unseen = np.zeros(count, np.float16), np.zeros(count, np.uint8), np.zeros(count, np.float16)
+        abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
         own, tilt = np.zeros_like(result.albedo), np.zeros_like(result.albedo)
+        shared = self._shared_misfit(light)
         light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
 
         def fit(batch: Batch) -> None:
@@ -249,7 +255,7 @@ class _Walk:
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
                                  pairs=self._pairs, metals=self._metals, roughness=roughness, prior=self._prior(pixels),
-                                 beside=self._beside(pixels))
+                                 beside=self._beside(pixels), shared_misfit=shared)
             result.normal[:, pixels] = found.normal.T
             material = fit_given(samples, found.normal, MATT, shape=self._lobe) if self._matt else found
             result.albedo[:, pixels] = material.diffuse_albedo.T
@@ -258,15 +264,29 @@ class _Walk:
             error = albedo_error(samples, found.normal, material, shape=self._lobe, shared=MATT[None] if self._matt else materials)
             own[:, pixels], tilt[:, pixels] = error.own.T, error.tilt.T
             abundance[pixels], pair[pixels] = found.mixture
-            sigma[pixels], unseen[pixels], result.residual[pixels] = found.sigma, found.unseen, found.residual
+            sigma[pixels], result.residual[pixels] = found.sigma, found.residual
 
         self._batches("normals", fit, Results(
-            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, unseen, result.residual, own, tilt),
-            (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
-        result.unseen, result.albedo_own, result.albedo_tilt = unseen, own, tilt
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt),
+            (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals,
+             shared)))
+        result.shared_misfit, result.albedo_own, result.albedo_tilt = shared, own, tilt
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
             result.facts["mixed_pixels"] = int(mixed.sum())
+
+    def _shared_misfit(self, light: DirectLight | None) -> float:
+        """Return the share of the misfit that neighbouring pixels have in common."""
+        solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
+        start = pair_starts(solved, SHARED_PAIRS)
+        if light is None or not len(start):
+            return UNKNOWN_SHARE
+        pixels = np.concatenate([start, start + APART])
+        samples = self._pick(pixels)
+        light.keep(pixels, samples)
+        shared = shared_misfit(samples, descend(samples, self.result.normal[:, pixels].T, shape=self._shape), shape=self._shape)
+        self.result.facts["shared_misfit"] = round(shared, 4)
+        return shared
 
     @property
     def _few(self) -> bool:

@@ -176,6 +176,14 @@ def test_result_says_when_it_gave_up(device):
     assert result.residual > 1e-6
 
 
+def test_a_tolerance_below_rounding_spoils_nothing(device):
+    """Float32 heights do not come closer than some 1e-6; the iterations end there, and do not divide rounding errors by each other."""
+    shape = shapes.cap(48)
+    plain, pushed = solve(shape, device), solve(shape, device, tolerance=1e-10)
+    assert pushed.iterations < 200
+    np.testing.assert_allclose(pushed.height.numpy(), plain.height.numpy(), atol=1e-4 * np.ptp(shape.z))
+
+
 def test_graphs_of_launches_give_the_same(monkeypatch):
     """Warp captures and replays launches on the CPU too, as long as one core makes them."""
     shape, graphs = shapes.bumps(60, shapes.ragged_mask(60, 60)), []

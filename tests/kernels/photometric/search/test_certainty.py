@@ -5,7 +5,9 @@ import pytest
 
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.search.certainty import ring_areas
+from kernels.photometric.search.descent import descend
 from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfit
 from kernels.photometric.search.survey import CLOSE
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
@@ -55,13 +57,32 @@ def test_three_lights_are_never_sure(device):
 
 
 def test_many_lights_are_as_sure_as_they_are_right(device):
-    """In the model: the median error over sigma is about one, and sigma is small."""
+    """In the model: the median error over sigma is about one, and sigma is small. Noise of each pixel is shared with none."""
     normal = tilted(200, 60.0)
     rng = np.random.default_rng(3)
     radiance = render(normal, alpha=0.2)
     radiance = np.maximum(radiance * (1 + 0.03 * rng.normal(size=radiance.shape)), 0)
-    fit = solve_svbrdf(sample(radiance, device)[0], twin.unit(normal + [0.03, 0, 0]), shape=Diffuse())
+    fit = solve_svbrdf(sample(radiance, device)[0], twin.unit(normal + [0.03, 0, 0]), shape=Diffuse(), shared_misfit=0.0)
     error = degrees(fit.normal, normal)
     assert 0.4 < np.median(error / fit.sigma) < 1.4
     assert (error > 5 * fit.sigma).mean() < 0.01
     assert np.median(fit.sigma) < 1
+
+
+def test_neighbours_share_misfit_and_no_noise(device):
+    """Two pixels of one normal and material. Errors of 5 % that both have are misfit, whatever causes them, and those of each are noise; of
+    both kinds alike, half is shared. The tolerance is that of a median over 300 pairs, and of what the fits take up."""
+    normal = tilted(300, 50.0)
+    clean, rng = render(normal), np.random.default_rng(5)
+
+    def share(common: float, own: float) -> float:
+        both = common * rng.normal(size=clean.shape)
+        pairs = np.concatenate([clean * (1 + both + own * rng.normal(size=clean.shape)) for _ in range(2)], axis=2)
+        samples = sample(pairs, device)[0]
+        return shared_misfit(samples, descend(samples, np.tile(normal, (2, 1)), shape=Diffuse()), shape=Diffuse())
+
+    assert share(0.0, 0.05) < 0.1
+    assert share(0.05, 0.0) > 0.9
+    assert 0.3 < share(0.05, 0.05) < 0.7
+    none = sample(clean[..., :1], device)[0]
+    assert shared_misfit(none, descend(none, normal[:1], shape=Diffuse()), shape=Diffuse()) == UNKNOWN_SHARE
