@@ -30,6 +30,8 @@ SURE = 0.9
 """The part of the patches that have the colours of the chart where no other place is looked for."""
 LEAST = 0.6
 """The part of the patches that must have them: a place that is off by a row has half of them."""
+SAME = 0.1
+"""The distance of two places of the chart that count as one, in spacings of patches: the outlines of the patches move both to the same."""
 MOST_SEARCHED = 16
 """The most frames whose mean is searched for the chart; of more, evenly spaced ones are."""
 COLOURED = 0.02
@@ -145,7 +147,12 @@ def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipp
     Raises CalibrationError if there is none; says what is wrong with the first within the picture."""
     faults: list[CalibrationError] = []
     best: _Placed | None = None
+    judged: list[np.ndarray] = []
     for corners in find_charts(mean, len(chart.names)):
+        near = SAME * np.linalg.norm(corners[1] - corners[0]) / (chart.grid[0] - 1)
+        if any(np.abs(corners - other).max() < near for other in judged):
+            continue
+        judged.append(corners)
         try:
             place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])
         except CalibrationError:

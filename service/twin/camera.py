@@ -21,6 +21,7 @@ from service.relight.combine import linear_frames
 from service.relight.sheet import display, fit
 from service.relight.weights.weighting import light_weights
 from service.reporting.progress import Timings
+from service.reporting.provenance import colour_configuration
 from service.requests.play import PictureFault, PictureFormat, TwinRequest
 from service.twin.listener import Listener
 from stage.capture.capture import Capture
@@ -95,13 +96,14 @@ class TwinPicture:
         `most_rows`: the height to which a higher PNG is reduced; None: it is not. Raises StorageError if it cannot be written."""
         radiance = self.radiance(levels)
         if path.suffix.lower() == ".exr":
-            exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self.space, metadata={})
+            exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self.space,
+                      metadata=colour_configuration())
             return
         radiance = fit(radiance, min(len(radiance), most_rows or len(radiance)), kernel="triangle")
         shown = display(radiance * self._gain, self.space, self._review)
         shown[~radiance.any(axis=-1)] = 0.0  # and not the background of a sheet
         with replacing(path, flush=False) as temporary:
-            write_png(temporary, np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8), srgb=True)
+            write_png(temporary, np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8), srgb=True, texts=colour_configuration())
 
 
 class FaultSpan(NamedTuple):
