@@ -2,8 +2,8 @@
 
 A pattern and its inverse add up to even light, and so does a wave over its shifts, whatever is seen and however blurred it is. Where these
 sums differ between the bits of a code, or between the periods of its waves, frames of one pixel do not show one scene under the patterns
-that are declared: the camera has recorded parts of two patterns, or the surface has moved. Wide stripes of a Gray code that are neither dark
-nor bright tell the same.
+that are declared: the camera has recorded parts of two patterns, or the surface has moved. Wide stripes of a Gray code that are neither
+dark nor bright tell the same.
 """
 
 from collections.abc import Sequence
