@@ -27,7 +27,7 @@ def test_each_fault_is_named_with_its_frame_and_none_else(scene, seed, kinds):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("scene", "seeds"), [
-    (lambda seed: owl(), (0, 4, 17, 103)), (lambda seed: relief(5), (6, 13)), (relief, (2, 11, 14, 15)),
+    (lambda seed: owl(), (0, 17, 103)), (lambda seed: relief(5), (6, 13)), (relief, (2, 11, 14, 15)),
 ], ids=["owl", "one relief", "a relief each"])
 def test_each_fault_is_named_over_random_seeds(scene, seeds):
     """The first has no fault; of seed 17 lamps around the dead one light next to nothing of the owl, and of

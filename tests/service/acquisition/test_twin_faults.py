@@ -22,13 +22,12 @@ def twin(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
-def test_all_faults_of_a_capture_are_named_and_a_capture_without_any_retakes_nothing(twin, seed):
+def test_all_faults_of_a_capture_are_named_and_a_capture_without_any_retakes_nothing(twin):
     """benchmarks/on_set.py takes 20 seeds."""
-    sound = twin.capture(f"sound_{seed}", seed, {})
+    sound = twin.capture("sound", 1, {})
     assert sound.retaken == sound.faults == () and sound.there == 97
-    faults = twin.faults(seed)
-    mended = twin.capture(f"mended_{seed}", seed, faults)
+    faults = twin.faults(1)
+    mended = twin.capture("mended", 1, faults)
     assert named(mended.retaken) == wanted(faults) and mended.faults == ()
 
 
@@ -40,25 +39,27 @@ def test_without_retakes_each_fault_is_named_and_stays(twin):
     assert named((*result.retaken, *result.faults)) == wanted(faults) and result.there == 97 - 2
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("document", "pictures"), [("docs/set.md", 97), ("README.md", 96)])
-def test_the_commands_of_the_documents_take_and_solve_the_owl_without_a_picture_taken_again(tmp_path, document, pictures):
-    """As they have them, but for the crop of what is solved, for which --then stands alone; the twin's page has its port, and its lamps
-    those of sACN."""
-    if shutil.which("curl") is None:
-        pytest.skip("no curl")
+def commands_of(document: str) -> list[list[str]]:
+    """The words of the commands with which a document shows the stage that is not there."""
     page = (ROOT / document).read_text(encoding="utf-8")
     block = next(block for block in page.split("```")[1::2] if "samples/owl --pictures watched" in block)
-    program = f"{sys.executable} -m service.cli.main "
-    lines = [line.split("#")[0].strip().replace("relit ", program, 1) for line in block.strip().splitlines()]
+    return [shlex.split(line.split("#")[0]) for line in block.strip().splitlines()]
+
+
+@pytest.mark.long
+def test_the_commands_of_the_readme_take_and_solve_the_owl_without_a_picture_taken_again(tmp_path):
+    """As it has them, but for the crop of what is solved, for which --then stands alone; the twin's page has its port, and its lamps those
+    of sACN."""
+    if shutil.which("curl") is None:
+        pytest.skip("no curl")
+    program = [sys.executable, "-m", "service.cli.main"]
+    rig, twin, capture = ([*program, *words[1:]] for words in commands_of("README.md"))
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     place = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
-    rig, twin, capture, *then = map(shlex.split, lines)
-    if "--then" in capture:
-        steps = capture[capture.index("--then") + 1]
-        del capture[capture.index("--then"):]
-        commands = {"solve": "solve capture --out maps", "export": "export maps --out asset.usdz"}
-        then = [shlex.split(program + commands[step]) for step in steps.split(",")]
+    steps = capture[capture.index("--then") + 1]
+    del capture[capture.index("--then"):]
+    commands = {"solve": "solve capture --out maps", "export": "export maps --out asset.usdz"}
+    then = [[*program, *shlex.split(commands[step])] for step in steps.split(",")]
     subprocess.run(rig, check=True, **place)
     stage = subprocess.Popen(twin, stdout=subprocess.PIPE, **place)
     try:
@@ -68,9 +69,17 @@ def test_the_commands_of_the_documents_take_and_solve_the_owl_without_a_picture_
         stage.kill()
         stage.wait()
     report = json.loads((tmp_path / "capture" / "report.json").read_text())
-    assert (report["pictures"], report["retaken"], report["faults"]) == (pictures, [], [])
+    assert (report["pictures"], report["retaken"], report["faults"]) == (96, [], [])
     subprocess.run([*then[0], "--crop", CROP], check=True, **place)
     for command in then[1:]:
         subprocess.run(command, check=True, **place)
     assert (tmp_path / "maps" / "maps.exr").stat().st_size > 0
-    assert (tmp_path / "asset.usdz").exists() == (document == "README.md")
+    assert (tmp_path / "asset.usdz").exists()
+
+
+def test_the_commands_of_the_page_of_the_set_are_those_of_the_readme_with_a_dark_picture():
+    """So that one document's are run."""
+    readme, page = commands_of("README.md"), commands_of("docs/set.md")
+    options = readme[2][: readme[2].index("--then")]
+    assert page[:2] == readme[:2] and sorted(page[2]) == sorted([*options[:2], "dark,olat", *options[3:]])
+    assert page[3:] == [["relit", "solve", "capture", "--out", "maps"]]

@@ -23,7 +23,6 @@ from service.server.database.engine import Database
 from tests.service.server.api.asgi import Call, app_of, asynchronous
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
-from tests.service.server_process import serving
 
 BURST, QUEUED, FRAMES, FILES, BYTES = 30, 2, 10, 2, 1000
 PER_SECOND = 0.01
@@ -201,15 +200,13 @@ def test_files_that_are_too_large_or_too_many(client):
     refused(begin(client, capture, "Yw==", 1), 413, f"more than {FILES} are not taken")
 
 
-@pytest.mark.long
 def test_without_space_nothing_new_is_taken_and_the_service_says_so(tmp_path):
     """What is there can be read on."""
-    with serving(tmp_path, "--anonymous", "--device", "none", roots=str(SAMPLES), min_free_bytes=str(1 << 60)) as server, \
-            server.client() as client:
-        with server.database() as database:
-            there = new_id(CAPTURE)
-            database.transact(lambda connection: intakes.insert(
-                connection, identifier=there, project="default", kind=CAPTURE, name="test", folder=None))
+    with app_of(Settings(data=tmp_path, anonymous=True, roots=str(SAMPLES), min_free_bytes=1 << 60)) as app, \
+            TestClient(app, base_url="http://localhost") as client:
+        there = new_id(CAPTURE)
+        app.state.service.database.transact(lambda connection: intakes.insert(
+            connection, identifier=there, project="default", kind=CAPTURE, name="test", folder=None))
         for path, body in (("/v1/captures", {"name": "x"}), ("/v1/captures", {"name": "x", "folder": str(SAMPLES / "owl")}),
                            ("/v1/environments", {"name": "x"})):
             refused(client.post(path, json=body), 507, "no space left", later=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 
 import pytest
+from fastapi.testclient import TestClient
 from joserfc import jwt
 from joserfc.jwk import KeySet, RSAKey
 
@@ -18,7 +19,7 @@ from service.server.api.tokens import TokenReader
 from service.server.base.settings import Settings
 from service.server.database import audit
 from tests.service.answering import Asked, answering
-from tests.service.server_process import serving
+from tests.service.server.api.asgi import app_of
 
 GRANTS = "artists=larch:write,td=larch:admin,guests=willow:read"
 
@@ -149,21 +150,22 @@ def test_settings_that_cannot_be(settings, words):
         Settings(**settings)
 
 
-@pytest.mark.long
 def test_a_service_takes_tokens_beside_keys_and_audits_both(issuer, tmp_path):
-    with serving(tmp_path, "--device", "none", oidc_issuer=issuer.url, oidc_grants=GRANTS) as server:
-        with server.client(issuer.token()) as client:
+    with app_of(Settings(data=tmp_path, min_free_bytes=0, oidc_issuer=issuer.url, oidc_grants=GRANTS)) as app:
+        def holding(token: str) -> TestClient:
+            return TestClient(app, headers={"Authorization": f"Bearer {token}"})
+
+        with holding(issuer.token()) as client:
             made = client.post("/v1/captures", json={"name": "owl"})
             assert made.status_code == 201
             assert client.get("/v1/captures").json()["items"][0]["id"] == made.json()["id"]
             assert client.post("/v1/captures", json={"name": "owl", "folder": "/"}).status_code == 403  # needs admin
-        with server.client(issuer.token(groups=["guests"])) as other:
+        with holding(issuer.token(groups=["guests"])) as other:
             assert other.get("/v1/captures").json()["items"] == []
             assert other.post("/v1/captures", json={"name": "owl"}).status_code == 403
-        with server.client(issuer.token(exp=1)) as late:
+        with holding(issuer.token(exp=1)) as late:
             answer = late.get("/v1/captures")
             assert (answer.status_code, answer.headers["WWW-Authenticate"]) == (401, "Bearer")
-        with server.database() as database:
-            line = audit.listing(database, limit=1)[0]
+        line = audit.listing(app.state.service.database, limit=1)[0]
         assert (line["project"], line["action"], line["object"]) == ("larch", "intake.create", made.json()["id"])
         assert line["actor"].startswith("oidc_") and line["request"] == made.headers["X-Request-ID"]
