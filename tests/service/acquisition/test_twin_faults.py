@@ -48,8 +48,8 @@ def commands_of(document: str) -> list[list[str]]:
 
 @pytest.mark.long
 def test_the_commands_of_the_readme_take_and_solve_the_owl_without_a_picture_taken_again(tmp_path):
-    """As it has them, but for the crop of what is solved, for which --then stands alone; the twin's page has its port, and its lamps those
-    of sACN."""
+    """The commands run as they stand, but for the crop of what is solved: the steps of --then run by themselves, with it. The twin uses its
+    own port, and the lamps those of sACN."""
     if shutil.which("curl") is None:
         pytest.skip("no curl")
     program = [sys.executable, "-m", "service.cli.main"]
