@@ -177,11 +177,12 @@ def test_result_says_when_it_gave_up(device):
 
 
 def test_a_tolerance_below_rounding_spoils_nothing(device):
-    """Float32 heights do not come closer than some 1e-6; the iterations end there, and do not divide rounding errors by each other."""
+    """Float32 heights do not come closer than some 1e-6; the iterations end once the residual has grown a hundredfold from there (after a
+    group of four on CUDA), and do not divide rounding errors by each other, which made heights of many times the object's size."""
     shape = shapes.cap(48)
     plain, pushed = solve(shape, device), solve(shape, device, tolerance=1e-10)
     assert pushed.iterations < 200
-    np.testing.assert_allclose(pushed.height.numpy(), plain.height.numpy(), atol=1e-4 * np.ptp(shape.z))
+    np.testing.assert_allclose(pushed.height.numpy(), plain.height.numpy(), atol=1e-3 * np.ptp(shape.z))
 
 
 def test_graphs_of_launches_give_the_same(monkeypatch):
