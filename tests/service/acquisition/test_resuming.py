@@ -10,7 +10,6 @@ import pytest
 from scipy import ndimage
 
 from service.acquisition.acquire import acquire, refuse_to_ask
-from service.acquisition.cameras.camera import open_camera
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.early_ingest import PREVIEW_FILE, write_preview
@@ -41,11 +40,6 @@ class Program:
         self.stop = threading.Event()
         stage.release = self.release
 
-    def open(self, given, setup):
-        camera = open_camera(given, setup)
-        camera.settings = self.settings
-        return camera
-
     def release(self) -> None:
         scene = self.stage.scene
         self.stage.scene = scene._replace(images=np.roll(self.gain * scene.images, self.shift_px, axis=2))
@@ -67,7 +61,7 @@ def program(tmp_path, monkeypatch):
     found = Program(stage)
     found.ends_after = 3
     monkeypatch.setattr(WatchedFolder, "_release", lambda camera, exposure: stage.release())
-    monkeypatch.setattr("service.acquisition.acquire.open_camera", found.open)
+    monkeypatch.setattr(WatchedFolder, "settings", property(lambda camera: found.settings))
     return found
 
 
