@@ -28,7 +28,7 @@ def file(tmp_path_factory):
 
 
 def fused(file, out):
-    found = fuse(FuseRequest(scan_set=file, out=out, voxel_m=VOXEL, texture=False, device="cpu"))
+    found = fuse(FuseRequest(scan_set=file, out=out, voxel_m=VOXEL, texture=False, close="none", device="cpu"))
     ply = read_ply_points(found.mesh_path)
     return found.facts, ply, ply.points[read_faces(found.mesh_path)].reshape(-1, 9)
 
@@ -40,11 +40,12 @@ def test_boxes_of_a_few_pixels_give_the_surface_of_whole_bricks(file, tmp_path, 
     cut_facts, cut, cut_corners = fused(file, tmp_path / "cut")
     assert cut_facts["scans"] == facts["scans"] and cut_facts["holes"]["open_edges"] == facts["holes"]["open_edges"]
     ours, theirs = (np.lexsort(ply.points.T) for ply in (cut, whole))
-    assert np.array_equal(cut.points[ours], whole.points[theirs]) and np.array_equal(cut.sigma[ours], whole.sigma[theirs])
+    assert np.array_equal(cut.points[ours], whole.points[theirs])
     assert np.array_equal(np.unique(cut_corners, axis=0), np.unique(corners, axis=0))
     # where boxes meet, a vertex is blended by the angle to the faces that one of them has: 64 of 135 000 differ, one by more than 2
     differ = np.abs(cut.colours[ours].astype(int) - whole.colours[theirs]).max(axis=1)
     assert (differ > 0).mean() < 2e-3 and (differ > 2).mean() < 1e-4
+    assert (cut.sigma[ours] != whole.sigma[theirs]).mean() < 2e-3  # the views that see it too, over which errors average
 
 
 @pytest.mark.long
