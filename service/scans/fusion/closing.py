@@ -8,12 +8,14 @@ Source: Barequet and Sharir, "Filling gaps in the boundary of a polyhedron", CAG
 refine, smooth. His thin plate would bulge out of the open underside of a scan, so that a membrane takes its place.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from service.scans.fusion.holes import area_vectors, simple_chains
 
@@ -25,7 +27,8 @@ MOST_ROUNDS = 200
 """Rounds of halving after which a membrane is left as fine as it is."""
 
 
-class Closed(NamedTuple):
+@dataclass(frozen=True)
+class Closed:
     """What closes a mesh of V vertices: A further ones, and faces of both."""
 
     faces: np.ndarray  # [n, 3] int32, wound as those of the mesh; numbers from V on are those of the further vertices
@@ -33,10 +36,14 @@ class Closed(NamedTuple):
     system: csc_array  # [A, A]: times values at the further vertices it is `around` times those at the vertices of the mesh
     around: csc_array  # [A, V]
 
+    @cached_property
+    def _factors(self) -> SuperLU:
+        return splu(self.system)
+
     def extended(self, values: np.ndarray) -> np.ndarray:
         """Return values [V, …] at the vertices of the mesh, with those at the further ones behind them: as smooth as can be, [V + A, …]."""
         flat = values.reshape(len(values), -1).astype(np.float64)
-        further = splu(self.system).solve(self.around @ flat) if self.system.shape[0] else np.zeros((0, flat.shape[1]))
+        further = self._factors.solve(self.around @ flat) if self.system.shape[0] else np.zeros((0, flat.shape[1]))
         return np.concatenate([values, further.reshape(len(further), *values.shape[1:]).astype(values.dtype)])
 
 

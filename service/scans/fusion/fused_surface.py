@@ -53,12 +53,12 @@ class Surface(NamedTuple):
         """Return the surface with what closes its holes; `invented`: nothing was measured there, and σ is not known."""
         before, further = len(self.points), closed.system.shape[0]
         points = closed.extended(self.points)
-        faces = np.concatenate([self.faces, closed.faces])
-        normals = np.concatenate([self.normals, _normals_of_faces(points, faces)[before:].astype(np.float32)])
+        normals = np.concatenate([self.normals, _normals_of_faces(points, closed.faces)[before:].astype(np.float32)])
         none = np.zeros(further, dtype=bool)
         sigma = np.concatenate([self.sigma, np.full(further, np.nan, np.float32)]) if invented else closed.extended(self.sigma)
         seen = np.concatenate([self.seen, none.astype(np.uint16)]) if invented else closed.extended(self.seen)
-        return self._replace(points=points, normals=normals, sigma=sigma, seen=seen, faces=faces, values=closed.extended(self.values),
+        return self._replace(points=points, normals=normals, sigma=sigma, seen=seen, values=closed.extended(self.values),
+                             faces=np.concatenate([self.faces, closed.faces]),
                              photometric=np.concatenate([self.photometric, none]),
                              invented=np.arange(before + further) >= before if invented else None)
 
