@@ -40,7 +40,8 @@ USED = {
 
 @pytest.fixture(scope="module")
 def document(server) -> dict[str, Any]:
-    return httpx2.get(f"{server.url}/v1/openapi.json").raise_for_status().json()
+    with server.client() as client:
+        return client.get("/v1/openapi.json").raise_for_status().json()
 
 
 def resolved(document: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
