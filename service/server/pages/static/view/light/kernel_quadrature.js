@@ -18,18 +18,21 @@ export function covariance(cosine, range) {
  * @param {Float64Array} inverse [lights + 1, lights + 1] of the bordered covariance.
  * @param {number} count Of the lights.
  * @param {Float64Array} moments [lights + 1], of light whose energy is one.
+ * @param {Set<number>} held Lights to hold at zero at first; afterwards those that are. The weights do not depend on it, but come soonest from
+ * the lights that were held for light like this.
  * @returns {Float64Array} [lights]
  */
-export function quadratureWeights(inverse, count, moments) {
-  const at = (row, col) => inverse[row * (count + 1) + col];
-  const best = Float64Array.from({ length: count }, (_, row) => moments.reduce((sum, moment, col) => sum + at(row, col) * moment, 0));
-  const held = new Set();
+export function quadratureWeights(inverse, count, moments, held) {
+  const across = count + 1;
+  const best = new Float64Array(count);
+  for (let row = 0; row < count; row += 1) for (let col = 0; col < across; col += 1) best[row] += inverse[row * across + col] * moments[col];
   let [fewest, patience] = [count + 1, PATIENCE];
-  let weights = best;
+  const weights = best.slice();
   for (let exchange = 0; exchange < MOST_EXCHANGES; exchange += 1) {
-    const lights = [...held].sort((a, b) => a - b);
-    const force = solve(lights.map((row) => lights.map((col) => at(row, col))), lights.map((light) => -best[light]));
-    weights = best.map((value, row) => lights.reduce((sum, light, index) => sum + at(row, light) * force[index], value));
+    const lights = Int32Array.from(held).sort();
+    const force = solve(inverse, across, lights, best);
+    weights.set(best);
+    lights.forEach((light, index) => { for (let row = 0; row < count; row += 1) weights[row] += inverse[light * across + row] * force[index]; });
     const signs = weights.slice();
     lights.forEach((light, index) => { signs[light] = force[index]; weights[light] = 0; });
     let wrong = [...signs.keys()].filter((light) => signs[light] < -ROUNDING);
@@ -39,29 +42,29 @@ export function quadratureWeights(inverse, count, moments) {
     else wrong = wrong.slice(-1);
     for (const light of wrong) if (!held.delete(light)) held.add(light);
   }
-  weights = weights.map((weight) => Math.max(0, weight));
-  const sum = weights.reduce((a, b) => a + b, 0);
-  return weights.map((weight) => weight / sum);
+  const positive = weights.map((weight) => Math.max(0, weight));
+  const sum = positive.reduce((a, b) => a + b, 0);
+  return positive.map((weight) => weight / sum);
 }
 
-/** Return the solution of a dense system, by elimination with pivots. */
-function solve(matrix, right) {
-  const count = right.length;
-  const rows = matrix.map((row, index) => Float64Array.from([...row, right[index]]));
-  for (let col = 0; col < count; col += 1) {
-    let pivot = col;
-    for (let row = col + 1; row < count; row += 1) if (Math.abs(rows[row][col]) > Math.abs(rows[pivot][col])) pivot = row;
-    [rows[col], rows[pivot]] = [rows[pivot], rows[col]];
-    for (let row = col + 1; row < count; row += 1) {
-      const factor = rows[row][col] / rows[col][col];
-      if (factor !== 0) for (let k = col; k <= count; k += 1) rows[row][k] -= factor * rows[col][k];
-    }
-  }
+/** Return the forces [held] that make the weights of held lights zero, by Cholesky's factors: the covariance left of some lights is positive definite. */
+function solve(inverse, across, held, best) {
+  const count = held.length;
+  const factor = new Float64Array(count * count);
   const found = new Float64Array(count);
+  for (let row = 0; row < count; row += 1) {
+    let right = -best[held[row]];
+    for (let col = 0; col <= row; col += 1) {
+      let value = inverse[held[row] * across + held[col]];
+      for (let k = 0; k < col; k += 1) value -= factor[row * count + k] * factor[col * count + k];
+      factor[row * count + col] = col === row ? Math.sqrt(value) : value / factor[col * count + col];
+      if (col < row) right -= factor[row * count + col] * found[col];
+    }
+    found[row] = right / factor[row * count + row];
+  }
   for (let row = count - 1; row >= 0; row -= 1) {
-    let value = rows[row][count];
-    for (let col = row + 1; col < count; col += 1) value -= rows[row][col] * found[col];
-    found[row] = value / rows[row][row];
+    for (let k = row + 1; k < count; k += 1) found[row] -= factor[k * count + row] * found[k];
+    found[row] /= factor[row * count + row];
   }
   return found;
 }

@@ -9,6 +9,7 @@ import { discSamples } from "./disc_light.js";
 import { covariance, quadratureWeights } from "./kernel_quadrature.js";
 
 const WHOLE = 1 - 1e-6; // but for rounding
+const SAME = 1e-13; // moments of light whose energy is one differ by rounding
 
 /** Light as sums over its directions, in three channels. */
 class LightSum {
@@ -35,6 +36,7 @@ export class LightModel {
     this.kept = relight.quadrature.kept;
     this.tables = tables;
     this.lights = lights;
+    this.held = [0, 1, 2].map(() => new Set()); // lights without weight in the light before, by channel
     this.covariances = null; // of every cell of the grid with every light
   }
 
@@ -58,10 +60,15 @@ export class LightModel {
 
   /** Return the coefficients [tiles, terms, 3] of light. */
   coefficients(sum) {
+    let [before, weights] = [null, null];
     const energies = sum.outside.map((outside, channel) => {
       const whole = sum.moments[channel].at(-1);
-      const weights = whole > 0 ? quadratureWeights(this.tables.inverse, this.kept.length, sum.moments[channel].map((moment) => moment / whole)) : null;
-      return outside.map((energy, index) => energy + (weights === null ? 0 : whole * weights[index]));
+      if (!(whole > 0)) return outside;
+      const moments = sum.moments[channel].map((moment) => moment / whole);
+      const isSame = before?.every((moment, index) => Math.abs(moment - moments[index]) < SAME) ?? false; // as of light of one colour
+      if (!isSame) weights = quadratureWeights(this.tables.inverse, this.kept.length, moments, this.held[channel]);
+      before = moments;
+      return outside.map((energy, index) => energy + whole * weights[index]);
     });
     const found = new Float32Array(this.each);
     this.kept.forEach((light, index) => this.#add(found, light, energies.map((each, channel) => each[index] / this.lights[light].irradiance[channel])));
