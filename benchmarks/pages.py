@@ -27,8 +27,10 @@ LOADS = 3
 SHOWN = {"/": ".card canvas", "captures": "#captures a", "jobs": "#jobs tbody a", "machines": "#audit tbody tr",
          "capture": "#frames canvas", "job": "#stages tbody tr", "light": "canvas.picture[data-shown]",
          "object": "canvas.picture[data-shown]", "maps": "canvas.map",
-         "asset": "canvas.scene[data-share]"}
-"""What a page is opened for; of the light a first picture."""
+         "asset": "canvas.scene[data-shown]"}
+"""What a page is opened for; of the light and of 3-D a first picture, which may be the server's."""
+WHOLE = {"asset": "canvas.scene[data-share]"}
+"""What is on a page last, where it comes after all that the page waits for."""
 TASKS = """globalThis.tasks = [];
 new PerformanceObserver((list) => tasks.push(...list.getEntries().map(({ duration }) => duration)))
   .observe({ type: "longtask", buffered: true });"""
@@ -110,6 +112,8 @@ def _print_loads(browser: Browser, url: str, name: str, path: str, words: str = 
         page.locator(SHOWN[name]).first.wait_for()
         shown = page.evaluate("performance.now()")
         page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+        if name in WHOLE:
+            page.locator(WHOLE[name]).first.wait_for()
         whole = page.evaluate("performance.now()")
         found.append({"paint": page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime"),
                       "shown": shown, "whole": whole, "task": page.evaluate("Math.max(0, ...tasks)"),

@@ -3,17 +3,19 @@
 import { attempt, fetched, listing, resultsOf } from "../api.js";
 import { bytes, element, tell } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
+import { showPoster } from "../scene/poster.js";
 import { canRender } from "../view/light/basis_renderer.js";
+import { ViewFile } from "../view/view_file.js";
 import { captureOf, findView } from "../view_jobs.js";
 
 const SHOWN = /(^|\/)asset\.(usdz|glb)$/;
 const LARGE = 100e6; // bytes, which are asked about before they are loaded
 
-/** Return view.json of the capture that a job comes from; null: no view of it is prepared. */
-async function rigOf(job) {
+/** Return the view of the capture that a job comes from; null: none is prepared. */
+async function viewOf(job) {
   const capture = await captureOf(job);
   const view = capture === null ? null : await findView({ capture });
-  return view?.state === "succeeded" ? resultsOf(view.id).json("view.json") : null;
+  return view?.state === "succeeded" ? ViewFile.open(resultsOf(view.id)) : null;
 }
 
 async function findAsset(job) {
@@ -34,11 +36,17 @@ export async function mountAsset(parent, job, named = () => {}) {
     return;
   }
   const show = async () => {
-    parent.replaceChildren(element("p", { role: "status" }, `Loading ${bytes(result.size)} …`));
-    const [{ mount }, data, environments, rig] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
-      readyEnvironments(), rigOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; })]);
-    named(job.request.name || rig?.name || job.id);
-    globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data }, { rig, environments, load: loadEnvironment });
+    const canvas = element("canvas", { class: "scene" });
+    parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas),
+      element("div", { class: "panel" }, element("p", { role: "status" }, `Loading ${bytes(result.size)} …`))));
+    const rig = viewOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; });
+    const poster = rig.then((view) => view?.card() ?? null).catch(() => null); // a view that an earlier build has made has none
+    poster.then((picture) => picture !== null && showPoster(canvas, picture));
+    const [{ mount }, data, environments, view] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
+      readyEnvironments(), rig]);
+    named(job.request.name || view?.info.name || job.id);
+    globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data },
+      { rig: view?.info ?? null, environments, load: loadEnvironment, poster: await poster });
   };
   if (result.size <= LARGE) {
     await show();

@@ -11,6 +11,7 @@ import { Address } from "../publish/address.js";
 import { ControlAddress } from "../view/control_address.js";
 import { Distance, lengthText } from "./distance.js";
 import { OrbitScene } from "./orbit_scene.js";
+import { showPoster } from "./poster.js";
 import { RigLights } from "./rig_lights.js";
 import { SURFACES, Surfaces } from "./surfaces.js";
 
@@ -22,12 +23,13 @@ const MOST_STOPS = 10;
  * Show an asset.
  * @param {HTMLElement} parent Takes it.
  * @param {{name: string, data: ArrayBuffer}} file The asset, .usdz or .glb.
- * @param {{rig?: any, environments?: {id: string, name: string}[], load?: function(string): Promise<{name: string, data: ArrayBuffer}>}} [options]
+ * @param {{rig?: any, environments?: {id: string, name: string}[], load?: function(string): Promise<{name: string, data: ArrayBuffer}>, poster?: ImageBitmap|null}} [options]
  *     `rig` is the content of view.json of the capture, null if it is not known: then no lights are shown. Environments of the server, and how their files are read.
+ *     `poster` stands there until the asset is drawn.
  * @returns {Promise<{destroy: function(): void, state: function(): any, picture: function(): {rows: number, cols: number, pixels: Uint8Array}}>}
  * @throws {Error} The asset cannot be opened; a sentence.
  */
-export async function mount(parent, file, { rig = null, environments = [], load = undefined } = {}) {
+export async function mount(parent, file, { rig = null, environments = [], load = undefined, poster = null } = {}) {
   const asset = await openAsset(file.data, file.name);
   const lights = (rig?.frames ?? []).map((frame, index) => ({ frame, index })).filter(({ frame }) => frame.kind === "light" && frame.direction !== null);
   const stage = element("div", { class: "stage" });
@@ -72,6 +74,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   let map = null; // { name, ...pixels }
   let chosen = null; // stands for the map that was chosen last, which may still come
   const view = new OrbitScene(stage, `The asset ${file.name} in 3D`, { onclick: pick, onfault: (sentence) => { fault.textContent = sentence; } });
+  if (poster !== null) showPoster(view.canvas, poster);
   const { scene, renderer } = view;
   renderer.toneMapping = LinearToneMapping;
   const inCameraFrame = new Group(); // as all of Relit's pictures are, wherever the capture says that the camera stood

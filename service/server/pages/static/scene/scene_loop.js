@@ -122,6 +122,6 @@ export class SceneLoop {
     const pen = this.#canvas.getContext("2d");
     pen.globalCompositeOperation = "copy";
     pen.drawImage(drawn, 0, drawn.height - height, width, height, 0, 0, drawn.width, drawn.height);
-    this.#canvas.dataset.share = String(this.#share);
+    Object.assign(this.#canvas.dataset, { share: this.#share, shown: "live" });
   }
 }
