@@ -6,7 +6,6 @@ import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.j
 import { srgbByte, VIEW_TRANSFORM } from "../view/display.js";
 import { previewOf, readEnvironment } from "../view/light/environment_map.js";
 import { LightModel } from "../view/light/light_model.js";
-import { floats } from "../view/view_file.js";
 
 const SIDE = 120; // of a ball, pixels
 const GREY = 0.6; // of the brightest place of the matte ball over all frames, before the display transform
@@ -111,7 +110,7 @@ export async function mountObject(parent, view, directions, frames, space) {
   const { quadrature } = relight;
   const [inverse, beyond, outside, captured, index, matte] = await Promise.all(
     view.blocks([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index, relight.matte]));
-  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
+  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: new Uint16Array(captured) }, lights);
   const canvas = element("canvas", { class: "picture", width: relight.cols, height: relight.rows, role: "img", "aria-label": `${view.info.name} under the lamps` });
   const stops = element("input", { type: "range", min: -10, max: 10, step: 0.1, value: 0, "aria-label": "Exposure of the object in stops" });
   const renderer = new BasisRenderer(canvas, relight, view.info.color_space);

@@ -3,6 +3,7 @@
  * row for each tile of the picture (docs/view.md). Pixels without object read nothing but their coverage.
  */
 
+import { breath } from "../../breath.js";
 import { DISPLAY_SPACE, matrixBetween } from "../colour_spaces.js";
 import { FrameTimer } from "./frame_timer.js";
 
@@ -58,7 +59,8 @@ void main() {
   colour = vec4(encoded + (1.0 - cover) * backdrop, 1.0);
 }`;
 
-const SLICE = 1 << 18; // pixels that are put into a texture at once
+const SLICE = 1 << 17; // pixels that are put into a texture at once
+const LOOK_MS = 4; // between two looks whether they are there
 
 /** Return whether this browser can relight, on a canvas if one is given. */
 export function canRender(canvas = document.createElement("canvas")) {
@@ -72,6 +74,7 @@ function contextOf(canvas) {
 export class BasisRenderer {
   #gl;
   #places;
+  #put = 0; // pixels of coefficient images since the graphics processor was last waited for
 
   /**
    * @param {HTMLCanvasElement} canvas As large as the coefficient images.
@@ -125,8 +128,16 @@ export class BasisRenderer {
       }
       gl.activeTexture(gl.TEXTURE0);
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, row, term, cols, some, 1, gl.RGBA, gl.HALF_FLOAT, pixels);
-      if (row + some < rows) await new Promise((resolve) => { setTimeout(resolve); });
+      this.#put += cols * some;
+      if (this.#put < 2 * SLICE) await breath();
+      else await this.#isThere(); // else the page would wait for the graphics processor when there is no more room for what it has yet to take
     }
+  }
+
+  async #isThere() {
+    this.#put = 0;
+    const fence = this.fence();
+    while (!this.isPast(fence)) await new Promise((resolve) => { setTimeout(resolve, LOOK_MS); });
   }
 
   /** Take the coverage: bytes [rows, cols]. */

@@ -6,6 +6,7 @@ import { unit } from "./disc_light.js";
 
 const SIDE = 240;
 const STEP_DEGREES = 5;
+const [HATCH, GROUND] = [[200, 70, 50, 255], [128, 122, 118, 60]];
 const BACK = 2; // radius of the direction −z, where 1 is 90° from the view axis
 
 /** Return the direction at a place of the diagram, the inverse of placeOf; places outside are moved to its rim. */
@@ -42,8 +43,7 @@ export function mountDomeControl(parent, model, captured, moved) {
         const [x, y] = [((2 * col + 1) / SIDE - 1) * BACK, ((2 * row + 1) / SIDE - 1) * BACK];
         if (Math.hypot(x, y) > BACK) continue;
         const hatched = model.isBeyond(directionAt(x, y));
-        const line = (row + col) % 8 < 3;
-        image.data.set(hatched ? (line ? [200, 70, 50, 255] : [128, 122, 118, 60]) : [128, 122, 118, 60], 4 * (row * SIDE + col));
+        image.data.set(hatched && (row + col) % 8 < 3 ? HATCH : GROUND, 4 * (row * SIDE + col));
       }
     }
     return image;

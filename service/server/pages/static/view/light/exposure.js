@@ -43,8 +43,14 @@ export class Exposure {
 
 /** Return the places of covered pixels, evenly spread. */
 function spread(matte) {
-  const inside = [];
-  matte.forEach((cover, at) => { if (cover === 255) inside.push(at); });
-  const step = Math.max(1, Math.floor(inside.length / SAMPLES));
-  return inside.filter((_, index) => index % step === 0);
+  let inside = 0;
+  for (const cover of matte) if (cover === 255) inside += 1;
+  const step = Math.max(1, Math.floor(inside / SAMPLES));
+  const places = [];
+  for (let at = 0, index = 0; at < matte.length; at += 1) {
+    if (matte[at] !== 255) continue;
+    if (index % step === 0) places.push(at);
+    index += 1;
+  }
+  return places;
 }

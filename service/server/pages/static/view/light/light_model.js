@@ -5,6 +5,7 @@
  * Directions are those of environment maps: +y at the top, +z in the middle, +x a quarter from the left edge.
  */
 
+import { floats } from "../view_file.js";
 import { discSamples } from "./disc_light.js";
 import { covariance, quadratureWeights } from "./kernel_quadrature.js";
 
@@ -25,7 +26,7 @@ class LightSum {
 export class LightModel {
   /**
    * @param {any} relight Of view.json.
-   * @param {{inverse: Float64Array, beyond: Float32Array, outside: Float32Array, captured: Float32Array}} tables Blocks of that name, `captured` decoded.
+   * @param {{inverse: Float64Array, beyond: Float32Array, outside: Float32Array, captured: Uint16Array}} tables Blocks of that name; `captured` are half floats.
    * @param {{direction: number[], irradiance: number[]}[]} lights All captured lights, in the order of `captured`.
    */
   constructor(relight, tables, lights) {
@@ -37,6 +38,7 @@ export class LightModel {
     this.tables = tables;
     this.lights = lights;
     this.held = [0, 1, 2].map(() => new Set()); // lights without weight in the light before, by channel
+    this.captured = []; // images that were needed so far, decoded
     this.covariances = null; // of every cell of the grid with every light
   }
 
@@ -87,7 +89,9 @@ export class LightModel {
 
   /** Add a captured image times a weight in each channel. */
   #add(found, light, weights) {
-    addWeighted(found, this.tables.captured.subarray(light * this.each, (light + 1) * this.each), weights.map((weight) => weight * this.scale));
+    if (weights.every((weight) => weight === 0)) return found;
+    this.captured[light] ??= floats(this.tables.captured.slice(light * this.each, (light + 1) * this.each).buffer, "float16");
+    addWeighted(found, this.captured[light], weights.map((weight) => weight * this.scale));
     return found;
   }
 
@@ -211,7 +215,6 @@ export class LightModel {
  * @param {number[]} weights [3]
  */
 export function addWeighted(found, colours, [red, green, blue]) {
-  if (red === 0 && green === 0 && blue === 0) return;
   for (let at = 0; at < colours.length; at += 3) {
     found[at] += red * colours[at];
     found[at + 1] += green * colours[at + 1];

@@ -1,5 +1,6 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
+import { breath } from "../../breath.js";
 import { element, tell } from "../../element.js";
 import { ViewState } from "../../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
@@ -12,7 +13,6 @@ import { EnvironmentProfile } from "./environment_profile.js";
 import { Exposure } from "./exposure.js";
 import { LightModel } from "./light_model.js";
 import { lightPanel, sizeOf } from "./light_panel.js";
-import { floats } from "../view_file.js";
 import { viewTable } from "../view_transforms.js";
 import { mountZoomed } from "../zoomed_picture.js";
 
@@ -73,10 +73,11 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   }
   const renderer = new BasisRenderer(drawn, relight, view.info.color_space); // its program is compiled while the blocks come
   const [inverse, beyond, outside, captured, index, coverage] = await Promise.all(tables);
-  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
+  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: new Uint16Array(captured) }, lights);
   const [tiles, matte] = [new Uint16Array(index), new Uint8Array(coverage)];
   renderer.setTiles(tiles);
   renderer.setMatte(matte);
+  await breath();
   const exposure = new Exposure(relight, matte, tiles);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
   const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
@@ -261,11 +262,11 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     spinning = requestAnimationFrame(step);
   });
 
-  await Promise.all(terms.map(async (block, term) => {
+  for (const [term, block] of terms.entries()) {
     const planes = new Uint16Array(await block);
     await renderer.setTerm(term, planes);
     exposure.setTerm(term, planes);
-  }));
+  }
   if (given.includes("environment") && control.environment.value === "") tell("The environment of this address is not on this server. Choose another.");
   if (control.environment.value !== "") {
     const { value } = control.environment;
