@@ -24,7 +24,7 @@ test: $(VENV)/installed-dev
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
 # and the kernels and products as on a GPU, on an emulated one, which takes what the others, who often wait, leave of the processors
 test-all: $(VENV)/installed-dev
-	$(EMULATED) >$(VENV)/emulated.log 2>&1 & emulated=$$!; $(PYTEST); tests=$$?; \
+	$(EMULATED) >$(VENV)/emulated.log 2>&1 & emulated=$$!; $(PYTEST) --durations=60; tests=$$?; \
 	  wait $$emulated || tests=$$?; cat $(VENV)/emulated.log; exit $$tests
 
 # keeps what Python compiles of modules and tests
