@@ -116,6 +116,16 @@ def light_by(page, path) -> None:
     page.wait_for_function("(name) => globalThis.asset.state().environment === name", arg=path.name, timeout=LOADED_MS)
 
 
+def test_the_card_stands_there_until_the_asset_is_drawn(page, exported):
+    held = []
+    page.route("**/asset.glb", lambda route: held.append(route))
+    page.goto(f"/asset/{exported['glb']}")
+    page.locator("canvas.scene[data-shown=card]").wait_for()
+    seen(page, lambda: held, "the asset is not asked for")
+    held.pop().continue_()
+    page.locator("canvas.scene[data-shown=live]").wait_for(timeout=LOADED_MS)
+
+
 def test_gltf_is_shown(asset):
     assert_shown(asset, asset.evaluate("() => globalThis.asset.state()"))
 
