@@ -46,8 +46,6 @@ HOST_CORES = 16
 """Cores of a host of one GPU."""
 ON_DEVICE = "service.relight.model_range._summed", "service.relight.guide.Guide._add", "warp.array.__del__"
 """Functions of the host, on the CPU, whose work kernels do on CUDA; and what gives memory back, which CUDA's pool keeps."""
-ALONE = "service.relight.model_range.ModelRange._facing",
-"""Functions that threads of the CPU call side by side, and one thread on CUDA."""
 PRODUCT_SIDE = 2048
 """Side of the matrices by whose product the speed of a core is measured."""
 
@@ -107,10 +105,10 @@ class Taken:
     """Processor seconds of kernels, and of functions that stand for them, by thread."""
 
     def __init__(self) -> None:
-        self.kernels, self.of_main, self.alone = 0.0, 0.0, 0.0
+        self.kernels, self.of_main = 0.0, 0.0
         self._lock, self._inside = threading.Lock(), threading.local()
 
-    def timed(self, plain: Callable[..., object], *, alone: bool = False) -> Callable[..., object]:
+    def timed(self, plain: Callable[..., object]) -> Callable[..., object]:
         """Return a function that also notes the seconds that its thread takes, unless a noted function calls it."""
         def run(*args: object, **options: object) -> object:
             if getattr(self._inside, "now", False):
@@ -121,11 +119,8 @@ class Taken:
             finally:
                 self._inside.now, seconds = False, time.thread_time() - began
                 with self._lock:
-                    if alone:
-                        self.alone += seconds
-                    else:
-                        self.kernels += seconds
-                        self.of_main += seconds if threading.current_thread() is threading.main_thread() else 0
+                    self.kernels += seconds
+                    self.of_main += seconds if threading.current_thread() is threading.main_thread() else 0
         return run
 
 
@@ -140,8 +135,8 @@ def timed_launches() -> Iterator[Taken]:
 
     with ExitStack() as stack:
         stack.enter_context(patch.object(devices.Recorded, "run", taken.timed(run)))
-        for name in (*ON_DEVICE, *ALONE):
-            stack.enter_context(patch(name, taken.timed(resolve_name(name), alone=name in ALONE)))
+        for name in ON_DEVICE:
+            stack.enter_context(patch(name, taken.timed(resolve_name(name))))
         yield taken
 
 
@@ -168,7 +163,7 @@ def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int |
             whole, main = time.process_time(), time.thread_time()
             run(folder, folder / "out", "cpu", device_ways.Counting())
             whole, main = time.process_time() - whole, time.thread_time() - main
-        alone = main - taken.of_main + taken.alone
+        alone = main - taken.of_main
         return {"kernels": taken.kernels, "host": alone, "threads": whole - taken.kernels - alone}
 
 

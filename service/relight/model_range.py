@@ -70,7 +70,7 @@ class ModelRange:
         self._grid = hidden_as_captured(grid, lights.direction)
         self._captured = upload_sources(captured_lights(lights.direction, lights.irradiance), model.device)
         self._ahead: dict[tuple[int, int], tuple[wp.array, SourcesOnDevice]] = {}
-        """On CUDA the directions of the grid that light each portion."""
+        """On CUDA the directions of the grid that light each portion, by `_key`."""
 
     def chunk(self, lights: Sequence[RangeLight], places: Sequence[int]) -> ChunkLight:
         """Put the light of frames on the device; `places` are the positions of the frames in the full chunk."""
@@ -135,13 +135,14 @@ class ModelRange:
         """
         packs = self._portion_packs(batch.surface.packs)
         room = self._room(packs)
-        for portion in self._portions(batch, band, visible, light.small, packs):
-            key = int(portion.position[0]), len(portion.position)
-            if key not in self._ahead:
-                facing = self._facing(portion)
-                self._ahead[key] = (wp.array(facing, dtype=wp.int32, device=self._model.device),
-                                    upload_sources(self._grid.taken(facing), self._model.device))
-            numbers, sources = self._ahead[key]
+        portions = list(self._portions(batch, band, visible, light.small, packs))
+        new = [portion for portion in portions if _key(portion) not in self._ahead]
+        with ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-model") as pool:
+            for portion, facing in zip(new, pool.map(self._facing, new), strict=True):
+                self._ahead[_key(portion)] = (wp.array(facing, dtype=wp.int32, device=self._model.device),
+                                              upload_sources(self._grid.taken(facing), self._model.device))
+        for portion in portions:
+            numbers, sources = self._ahead[_key(portion)]
             use(portion, numbers, *self._responses(portion, sources, *room, scale))
 
     def _room(self, packs: int) -> tuple[Responses, Responses]:
@@ -185,6 +186,11 @@ class ModelRange:
         respond(portion.surface, self._captured, portion.visible, captured)
         images = Captured.of(portion.band, portion.surface, portion.visible, self._lights.direction, self._lights.irradiance, scale)
         return grid, captured, shown_gloss(images, captured)
+
+
+def _key(portion: Portion) -> tuple[int, int]:
+    """Return the first position and the number of the pixels of a portion, which tell it from all others."""
+    return int(portion.position[0]), len(portion.position)
 
 
 def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
