@@ -1,11 +1,12 @@
 """An estimate for a GPU that is not at hand, from what products ask of a device and from published speeds: a section of docs/figures.md.
 
-    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed, and own patches
+    python -m benchmarks.device_estimate svbrdf 64 1 counted 256 1   # what one small scene asks, as JSON; or timed, and own patches
 
 What is asked of the device is counted on an emulated one (tests/emulated_device.py). Small scenes stand for 12 megapixels: all limits of
 memory are made small in the same ratio, so that bands, batches and chunks of frames, and so launches and waits, are as many. Bytes, and the
-processor seconds of a run on the CPU of this machine, are a + b · pixels, and with frames (a + b · pixels) + frames · (c + d · pixels),
-from two sizes and two counts of frames. What is bounded by a number of patches or blocks of pixels is the same for both sizes, and is added
+processor seconds of a run on the CPU of this machine, are a + b · pixels. All frames are counted, in as many chunks as at the full size;
+their seconds are (a + b · pixels) + frames · (c + d · pixels) + chunks · (e + f · pixels), from two sizes, two counts of frames, and one
+count in two chunks. What is bounded by a number of patches or blocks of pixels is the same for both sizes, and is added
 by itself: bytes for each patch of bounced light come from a third run with more of them, seconds from one that has as many as the product.
 """
 
@@ -28,6 +29,7 @@ from unittest.mock import patch
 import numpy as np
 
 from kernels import device as devices
+from service.relight import relight as product
 from service.requests.solve import Method
 from service.solve.height import interreflection
 from service.solve.methods import settling
@@ -78,7 +80,7 @@ class Work(NamedTuple):
     frames: int | None
     """None: there are no frames."""
     tried: tuple[int, ...]
-    """Counts of frames of the small runs."""
+    """Counts of frames of the small runs that are timed."""
     sides: tuple[int, int]
     """Sides of the small scenes whose asking is counted: batches of pixels, or patches, are cut into as many parts in both."""
     bar_s: float
@@ -87,7 +89,7 @@ class Work(NamedTuple):
 WORKS = {
     "svbrdf": Work("`svbrdf`, 12 megapixels × 96 lights", lambda _: device_ways.solving(Method.SVBRDF), None, (1,), (64, 128), 60.0),
     "guided": Work("240 guided frames of 12 megapixels, 96 lights", lambda frames: device_ways.relighting(guided=True, frames=frames), 240,
-                   (2, 4), (54, 108), 150.0),
+                   (4, 8), (54, 108), 150.0),
 }
 
 
@@ -140,9 +142,9 @@ def timed_launches() -> Iterator[Taken]:
         yield taken
 
 
-def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES) -> dict[str, float]:
-    """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU.
-    `patches`: of bounced light; None: as many of them and of blocks as the product takes."""
+def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES, chunks: int = 1) -> dict[str, float]:
+    """Return what one small scene asks of the emulated device, and in how many chunks of frames, or the processor seconds of kernels and host
+    on the CPU, where frames come in so many chunks. `patches`: of bounced light; None: as many of them and of blocks as the product takes."""
     devices.names()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -154,9 +156,10 @@ def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int |
         if counted:
             emulated_device.install()
             shrink_limits(side * side / PIXELS)
-            before = emulated_device.counts.copy()
+            before, guided = emulated_device.counts.copy(), stack.enter_context(patch.object(product, "_guided", wraps=product._guided))
             run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
-            return {name: emulated_device.counts[name] - before[name] for name in emulated_device.COUNTED}
+            return {**{name: emulated_device.counts[name] - before[name] for name in emulated_device.COUNTED}, "chunks": guided.call_count}
+        stack.enter_context(patch.object(product, "MODEL_CHUNK_FRAMES", max(1, frames // chunks)))
         run(folder, folder / "warm", "cpu", device_ways.Counting())  # compiles what is not cached
         shutil.rmtree(folder / "capture" / ".relit")  # decoding is part of the work
         with timed_launches() as taken:
@@ -169,32 +172,37 @@ def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int |
 
 def at_full_size(name: str) -> dict[str, float]:
     """Return the quantities of a work at its full size, each fitted to small runs in processes of their own."""
-    work, found = WORKS[name], {}
-    for counted, sides in ((True, work.sides), (False, TIMED_SIDES)):
-        runs = {(side, frames): _run(name, side, frames, counted=counted) for side in sides for frames in work.tried}
-        for quantity in next(iter(runs.values())):
-            known = {of: run[quantity] for of, run in runs.items()}
-            if quantity in ("launches", "waits"):
-                pixels = [known[sides[-1], frames] for frames in work.tried]
-            else:
-                pixels = [_line([side * side for side in sides], [known[side, frames] for side in sides], PIXELS) for frames in work.tried]
-            found[quantity] = pixels[0] if work.frames is None else _line(work.tried, pixels, work.frames)
-        if counted and work.frames is None:
-            few, more = runs[sides[0], work.tried[0]], _run(name, sides[0], work.tried[0], counted=True, patches=MORE_PATCHES)
-            for quantity in ("up", "down", "touched"):
-                found[quantity] += (more[quantity] - few[quantity]) / (MORE_PATCHES - FEW_PATCHES) * (interreflection.PATCHES - FEW_PATCHES)
-    if work.frames is None:  # a solve, whose bounced light is bounded
+    work = WORKS[name]
+    counts = {side: _run(name, side, work.frames or 1, counted=True) for side in work.sides}
+    found = {quantity: float(value) if quantity in ("launches", "waits", "chunks") else _at_pixels(counts, quantity)
+             for quantity, value in counts[work.sides[-1]].items()}
+    times = {frames: {side: _run(name, side, frames, counted=False) for side in TIMED_SIDES} for frames in work.tried}
+    twice = {side: _run(name, side, work.tried[-1], counted=False, chunks=2) for side in TIMED_SIDES} if work.frames else {}
+    for quantity in ("kernels", "host", "threads"):
+        tried = [_at_pixels(times[frames], quantity) for frames in work.tried]
+        found[quantity] = _line(work.tried, tried, work.frames) if work.frames else tried[0]
+        if work.frames:
+            found[quantity] += (found["chunks"] - 1) * max(0.0, _at_pixels(twice, quantity) - tried[-1])
+    if work.frames is None:
+        few, more = counts[work.sides[0]], _run(name, work.sides[0], 1, counted=True, patches=MORE_PATCHES)
+        for quantity in ("up", "down", "touched"):
+            found[quantity] += (more[quantity] - few[quantity]) / (MORE_PATCHES - FEW_PATCHES) * (interreflection.PATCHES - FEW_PATCHES)
         few, own = (_run(name, BOUNDED_SIDE, work.tried[0], counted=False, patches=patches) for patches in (FEW_PATCHES, None))
         for quantity, seconds in own.items():
             found[quantity] += max(0.0, seconds - few[quantity])
     return found
 
 
-def _run(name: str, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES) -> dict[str, float]:
+def _at_pixels(runs: dict[int, dict[str, float]], quantity: str) -> float:
+    """Return a quantity at the full size, from runs by the sides of their images."""
+    return _line([side * side for side in runs], [run[quantity] for run in runs.values()], PIXELS)
+
+
+def _run(name: str, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES, chunks: int = 1) -> dict[str, float]:
     """Return what `measure` does in a process of its own, with one thread of BLAS as the program has it: more would wait for each other,
     which takes processor time."""
     command = [sys.executable, "-m", "benchmarks.device_estimate", name, str(side), str(frames), "counted" if counted else "timed",
-               str(patches or "own")]
+               str(patches or "own"), str(chunks)]
     return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True,
                                           env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}).stdout))
 
@@ -230,13 +238,13 @@ def estimate_rows(device: Published = H200) -> list[str]:
             f"{SOURCES} Counts are those of scenes of {counted} pixels squared on the emulated device, "
             f"seconds of {' and '.join(map(str, TIMED_SIDES))} pixels squared, continued in a line to the full size. For the counts all "
             "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size; a CUDA graph "
-            "is one launch. Frames are counted as one chunk; the product makes as many at one time as 1/16 of the memory of the device "
-            "holds, and computes what the model responds again for each chunk. Bytes and seconds for patches of bounced light, "
+            "is one launch. The frames come in as many chunks as at the full size, where a chunk has as many as 1/16 of the memory of the "
+            "device holds; what the model responds is computed again for each. Bytes and seconds for patches of bounced light, "
             f"{interreflection.PATCHES} at most, are counted apart.", "",
             *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
 
 
-ROWS = ("", "---", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits", "copies, pinned memory, s",
+ROWS = ("", "---", "chunks of frames", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits", "copies, pinned memory, s",
         "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, one thread, s",
         f"host, in threads, on {HOST_CORES} cores, s",
         "**all**, with pageable copies, s", "bar, s")
@@ -247,16 +255,16 @@ def _column(work: Work, asked: dict[str, float], speed: float, device: Published
     moved, captured = asked["up"] + asked["down"], PIXELS * device_ways.LIGHTS * 3 * device_ways.HALF
     terms = [moved / device.pageable_per_s, (asked["launches"] + asked["waits"]) * device.launch_s, asked["touched"] / device.bytes_per_s,
              asked["kernels"] * speed / device.operations_per_s, asked["host"], asked["threads"] / HOST_CORES]
-    return [work.title, "---", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.1f}",
+    return [work.title, "---", f"{asked['chunks']:.0f}" if work.frames else "", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.1f}",
             f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
             f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
 
 
 def main() -> None:
     """Run one small scene, for at_full_size."""
-    name, side, frames, kind, patches = sys.argv[1:]
+    name, side, frames, kind, patches, chunks = sys.argv[1:]
     print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted",
-                             patches=None if patches == "own" else int(patches))))
+                             patches=None if patches == "own" else int(patches), chunks=int(chunks))))
 
 
 if __name__ == "__main__":
