@@ -143,8 +143,9 @@ def timed_launches() -> Iterator[Taken]:
 
 
 def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES, chunks: int = 1) -> dict[str, float]:
-    """Return what one small scene asks of the emulated device, and in how many chunks of frames, or the processor seconds of kernels and host
-    on the CPU, where frames come in so many chunks. `patches`: of bounced light; None: as many of them and of blocks as the product takes."""
+    """Return what one small scene asks of the emulated device, and in how many chunks of frames, or the processor seconds of kernels and
+    host on the CPU, where frames come in so many chunks. `patches`: of bounced light; None: as many of them and of blocks as the product
+    takes."""
     devices.names()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -244,8 +245,8 @@ def estimate_rows(device: Published = H200) -> list[str]:
             *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
 
 
-ROWS = ("", "---", "chunks of frames", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits", "copies, pinned memory, s",
-        "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, one thread, s",
+ROWS = ("", "---", "chunks of frames", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits",
+        "copies, pinned memory, s", "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, one thread, s",
         f"host, in threads, on {HOST_CORES} cores, s",
         "**all**, with pageable copies, s", "bar, s")
 
@@ -255,8 +256,8 @@ def _column(work: Work, asked: dict[str, float], speed: float, device: Published
     moved, captured = asked["up"] + asked["down"], PIXELS * device_ways.LIGHTS * 3 * device_ways.HALF
     terms = [moved / device.pageable_per_s, (asked["launches"] + asked["waits"]) * device.launch_s, asked["touched"] / device.bytes_per_s,
              asked["kernels"] * speed / device.operations_per_s, asked["host"], asked["threads"] / HOST_CORES]
-    return [work.title, "---", f"{asked['chunks']:.0f}" if work.frames else "", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.1f}",
-            f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
+    return [work.title, "---", f"{asked['chunks']:.0f}" if work.frames else "", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}",
+            f"{moved / captured:.1f}", f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
             f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
 
 
