@@ -257,8 +257,8 @@ def _column(work: Work, asked: dict[str, float], speed: float, device: Published
     terms = [moved / device.pageable_per_s, (asked["launches"] + asked["waits"]) * device.launch_s, asked["touched"] / device.bytes_per_s,
              asked["kernels"] * speed / device.operations_per_s, asked["host"], asked["threads"] / HOST_CORES]
     return [work.title, "---", f"{asked['chunks']:.0f}" if work.frames else "", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}",
-            f"{moved / captured:.1f}", f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
-            f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
+            f"{moved / captured:.1f}", f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}",
+            *(f"{term:.1f}" for term in terms), f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
 
 
 def main() -> None:
