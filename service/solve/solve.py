@@ -23,6 +23,7 @@ from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
+from service.solve.translucency import find_translucency
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
@@ -97,6 +98,11 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         _say_of_pairs(given, opened.method, solution)
     given.timings.stage("diagnosis", 1)
     diagnose(given, opened.capture, opened.lights, opened.declared, solution)
+    if isinstance(opened.lights, DistantLights):
+        translucency = find_translucency(given, opened.lights, solution)
+        if translucency is not None:
+            solution.warnings.append(translucency.sentence)
+            raise_error(solution, translucency.degrees)
     if "left_out_misfit" in solution.facts:
         from service.solve.methods.support import raise_undescribed
 

@@ -1,0 +1,128 @@
+"""Translucent things, told by the edges of their shadows in red and in blue.
+
+Light that enters a translucent body leaves it beside the place that it fell on. So shading and the edges of shadows are blurred, and
+normals come out too flat where the surface bends within the length of that way, and as sure as others: unshadowed readings of a blurred
+surface are those of a flatter one. Edges that are soft may as well come from large lamps or the lens. But these blur all colours alike,
+while a body scatters farther the light that it absorbs less (Jensen, Marschner, Levoy and Hanrahan, "A Practical Model for Subsurface
+Light Transport", SIGGRAPH 2001, table 1), so that its brighter colour has the softer edges. Bounced light lifts the brighter colour in
+shadows, but leaves their edges as sharp as they are; sensors with a mosaic of colours resolve red and blue alike.
+
+A body that scatters all colours alike, or much farther than its shadows are wide, is not told from an opaque one that is flatter.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from kernels.photometric.model.samples import evenly
+from kernels.status import ESTIMATED
+from service.solve.base.solution import Solution, SolveInput
+from stage.capture.point_lights import DistantLights
+
+SQUARE, MOST_SQUARES, MOST_LIGHTS = 32, 16, 24
+"""Pixels along a side of the squares of the image in which edges are looked for, and the most numbers of squares and of lights."""
+SPANS = 1, 2, 4
+"""Pixels between neighbours of the four on a line across an edge."""
+LEAST_COSINE = 0.25
+"""Least cosine between normal and light of readings that are compared: below, a small error of the normal makes a large one of them."""
+MOST_RATIO = 1.25
+"""A reading more above the median of its pixel is a highlight."""
+LEAST_EDGES = 50
+LEAST_CONTRAST = 0.4
+"""Least difference over three spans, in every colour: below, the shadow is narrower than they are."""
+LEAST_SHARPER = 1.12
+"""Least ratio of sharpness in the darker colour to that in the brighter: 0.9 to 1.04 in opaque scenes, with bounced light too, and real
+captures; 1.2 to 1.3 where light scatters twice as far in red as in blue."""
+BLUR = 0.8
+"""Standard deviation of the blur that is undone, in widths of an edge."""
+
+
+class Translucency(NamedTuple):
+    """What the edges of shadows say of a body."""
+
+    sharper: float
+    """Ratio of the sharpness of edges in the darker of red and blue to that in the brighter."""
+    width_px: float
+    """Width of an edge: its height over its slope."""
+    degrees: np.ndarray  # [pixels of the image] float32, error that the blur makes of normals; 0 where none is estimated
+
+    @property
+    def sentence(self) -> str:
+        """What is said of it."""
+        return (f"the edges of shadows are {self.width_px:.1f} px wide, and {100 * (self.sharper - 1):.0f} % sharper in the colour that "
+                "the object absorbs more, as where light runs below the surface of translucent things: normals are blurred as far, and the "
+                "layer sigma holds what that takes away; cover such things with matt paint or powder")
+
+
+def find_translucency(given: SolveInput, lights: DistantLights, solution: Solution) -> Translucency | None:
+    """Return what shadows say of the way of light below the surface, or None where they show none."""
+    if not (lights.irradiance > 0).all():
+        return None
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    squares = list(_ratios(given, lights, solution.normal, estimated))
+    red, _, blue = np.sum([albedo for albedo, _ in squares], axis=0) if squares else np.zeros(3)
+    darker = 0 if red < blue else 2
+    sharper, width = 0.0, 0.0
+    for span in SPANS:
+        edges = np.concatenate([_edges(ratio, span) for _, ratio in squares]) if squares else ()
+        if len(edges) < LEAST_EDGES:
+            continue
+        inner, outer = np.median(edges[:, 2] - edges[:, 1], axis=0), np.median(edges[:, 3] - edges[:, 0], axis=0)
+        if outer.min() < LEAST_CONTRAST:
+            continue
+        sharp = inner / outer
+        sharper = max(sharper, float(sharp[darker] / sharp[2 - darker]))
+        width = width or span / float(inner.mean())  # by the narrowest span that tells
+    if sharper < LEAST_SHARPER:
+        return None
+    return Translucency(sharper, width, _lost(solution.normal, estimated, BLUR * width))
+
+
+def _ratios(given: SolveInput, lights: DistantLights, normal: np.ndarray,
+            estimated: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield for squares of the image the mean colour [3] and the readings over those that are expected, [lights, rows, cols, 3] float32:
+    about 1 where a pixel is lit, and NaN where that is not known."""
+    rows, cols = (max(1, length // SQUARE) for length in estimated.shape)
+    corners = [(SQUARE * row, SQUARE * col) for row in range(rows) for col in range(cols)]
+    inside = [corner for corner in corners if 2 * estimated[corner[0] :, corner[1] :][:SQUARE, :SQUARE].sum() > SQUARE * SQUARE]
+    for row, col in (inside[number] for number in (evenly(len(inside), MOST_SQUARES) if inside else ())):
+        place = np.arange(estimated.size).reshape(estimated.shape)[row : row + SQUARE, col : col + SQUARE]
+        pixels, chosen = place.reshape(-1), evenly(len(lights.direction), MOST_LIGHTS)
+        radiance, usable = given.stack.pick_radiance(pixels)
+        cosine = lights.direction[chosen] @ normal[:, pixels].astype(np.float64)
+        known = usable[chosen] & (cosine > LEAST_COSINE) & estimated.reshape(-1)[pixels]
+        expected = lights.irradiance[chosen][:, None] * np.maximum(cosine, LEAST_COSINE)[..., None]
+        albedo = np.where(known[..., None], radiance[chosen] / expected, np.inf).astype(np.float32)
+        median = np.take_along_axis(np.sort(albedo, axis=0), (known.sum(axis=0) // 2)[None, :, None], axis=0)[0]  # lit, where most are
+        told = np.isfinite(median) & (median > 0)
+        ratio = np.where(known[..., None] & told, albedo, np.nan) / np.where(told, median, 1)
+        yield np.where(told, median, 0).mean(axis=0), ratio.reshape(-1, *place.shape, 3)
+
+
+def _edges(ratio: np.ndarray, span: int) -> np.ndarray:
+    """Return the readings at four pixels on a line across an edge of a shadow, from dark to lit, between the inner of which half of the
+    light is passed: [edges, 4, 3]."""
+    grey, found = ratio.mean(axis=-1), [np.zeros((0, 4, 3), np.float32)]
+    for axis in (1, 2):
+        colours, along = np.moveaxis(ratio, axis, 0), np.moveaxis(grey, axis, 0)
+        count = len(along) - 3 * span
+        if count <= 0:
+            continue
+        first, second = along[span:][:count], along[2 * span :][:count]
+        for places, step in ((np.nonzero((first < 0.5) & (second >= 0.5)), 1), (np.nonzero((first >= 0.5) & (second < 0.5)), -1)):
+            line = np.stack([colours[places[0] + number * span, *places[1:]] for number in range(4)][::step], axis=1)
+            found.append(line[np.isfinite(line).all(axis=(1, 2)) & (line < MOST_RATIO).all(axis=(1, 2))])
+    return np.concatenate(found)
+
+
+def _lost(normal: np.ndarray, estimated: np.ndarray, blur_px: float) -> np.ndarray:
+    """Return by how many degrees normals, already blurred, turn where they are blurred once more, root mean square nearby: [pixels]."""
+    weight = np.maximum(gaussian_filter(estimated.astype(np.float32), blur_px), 1e-6)
+    planes = normal.reshape(3, *estimated.shape)
+    blurred = np.stack([gaussian_filter(np.where(estimated, plane, 0).astype(np.float32), blur_px) for plane in planes])
+    blurred /= np.maximum(np.linalg.norm(blurred, axis=0), 1e-6)
+    turned = np.degrees(np.arccos(np.clip((blurred * planes).sum(axis=0), -1, 1)))
+    nearby = np.sqrt(gaussian_filter(np.where(estimated, turned**2, 0).astype(np.float32), blur_px) / weight)
+    return np.where(estimated, nearby, 0).reshape(-1)
