@@ -30,8 +30,8 @@ LEAST_COSINE = 0.25
 MOST_RATIO = 1.25
 """A reading more above the median of its pixel is a highlight."""
 LEAST_EDGES = 50
-LEAST_CONTRAST = 0.4
-"""Least difference over three spans, in every colour: below, the shadow is narrower than they are."""
+LEAST_CONTRAST = {"darker": 0.4, "brighter": 0.1}
+"""Least difference over three spans in the darker and the brighter of red and blue: below, the shadow is narrower than they are."""
 LEAST_SHARPER = 1.12
 """Least ratio of sharpness in the darker colour to that in the brighter: 0.9 to 1.04 in opaque scenes, with bounced light too, and real
 captures; 1.2 to 1.3 where light scatters twice as far in red as in blue."""
@@ -70,7 +70,7 @@ def find_translucency(given: SolveInput, lights: DistantLights, solution: Soluti
         if len(edges) < LEAST_EDGES:
             continue
         inner, outer = np.median(edges[:, 2] - edges[:, 1], axis=0), np.median(edges[:, 3] - edges[:, 0], axis=0)
-        if outer.min() < LEAST_CONTRAST:
+        if outer[darker] < LEAST_CONTRAST["darker"] or outer[2 - darker] < LEAST_CONTRAST["brighter"]:
             continue
         sharp = inner / outer
         sharper = max(sharper, float(sharp[darker] / sharp[2 - darker]))
