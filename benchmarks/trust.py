@@ -44,8 +44,8 @@ HEAD = """# How far confidence can be trusted
 - *Model*: whether the scene is one that the method's model describes.
 - No sentence and no σ tells of a light source of a time-of-flight camera that stands aside and is not declared: it makes all frequencies
   wrong by the same length, so that nothing in the frames contradicts it.
-- Of a translucent body normals are told to be blurred by the edges of its shadows in red and in blue: not where few shadows fall on it, where
-  it scatters all colours alike, or where light runs much farther in it than its shadows are wide.
+- Of a translucent body normals are told to be blurred by the edges of its shadows in red and in blue: not where few shadows fall on it,
+  where it scatters all colours alike, or where light runs much farther in it than its shadows are wide.
 
 """
 COLUMNS = ("| scene | model | pixels | solved | \\|e\\| / σ | far out | error, all | best half | confidence, median |\n"
