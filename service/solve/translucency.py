@@ -52,8 +52,8 @@ class Translucency(NamedTuple):
     def sentence(self) -> str:
         """What is said of it."""
         return (f"the edges of shadows are {self.width_px:.1f} px wide, and {100 * (self.sharper - 1):.0f} % sharper in the colour that "
-                "the object absorbs more, as where light runs below the surface of translucent things: normals are blurred as far, and the "
-                "layer sigma holds what that takes away; cover such things with matt paint or powder")
+                "the object absorbs more, as where light runs below the surface of translucent things, or where the lens blurs the other "
+                "colour: normals are blurred as far, and the layer sigma holds what that takes away; matt paint or powder keeps light out")
 
 
 def find_translucency(given: SolveInput, lights: DistantLights, solution: Solution) -> Translucency | None:
@@ -70,7 +70,7 @@ def find_translucency(given: SolveInput, lights: DistantLights, solution: Soluti
         if len(edges) < LEAST_EDGES:
             continue
         inner, outer = np.median(edges[:, 2] - edges[:, 1], axis=0), np.median(edges[:, 3] - edges[:, 0], axis=0)
-        if outer[darker] < LEAST_CONTRAST["darker"] or outer[2 - darker] < LEAST_CONTRAST["brighter"]:
+        if inner.min() <= 0 or outer[darker] < LEAST_CONTRAST["darker"] or outer[2 - darker] < LEAST_CONTRAST["brighter"]:
             continue
         sharp = inner / outer
         sharper = max(sharper, float(sharp[darker] / sharp[2 - darker]))
