@@ -5,17 +5,17 @@ import { bytes, element, tell } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
 import { showPoster } from "../scene/poster.js";
 import { canRender } from "../view/light/basis_renderer.js";
-import { ViewFile } from "../view/view_file.js";
+import { cardOf } from "../view/view_file.js";
 import { captureOf, findView } from "../view_jobs.js";
 
 const SHOWN = /(^|\/)asset\.(usdz|glb)$/;
 const LARGE = 100e6; // bytes, which are asked about before they are loaded
 
-/** Return the view of the capture that a job comes from; null: none is prepared. */
+/** Return the files of a view of the capture that a job comes from; null: none is prepared. */
 async function viewOf(job) {
   const capture = await captureOf(job);
   const view = capture === null ? null : await findView({ capture });
-  return view?.state === "succeeded" ? ViewFile.open(resultsOf(view.id)) : null;
+  return view?.state === "succeeded" ? resultsOf(view.id) : null;
 }
 
 async function findAsset(job) {
@@ -30,6 +30,10 @@ async function findAsset(job) {
  * @param {function(string): void} [named] Told the name of the asset.
  */
 export async function mountAsset(parent, job, named = () => {}) {
+  const view = viewOf(job);
+  const rig = view.then((files) => files?.json("view.json") ?? null)
+    .catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; });
+  const poster = view.then((files) => (files === null ? null : cardOf(files))).catch(() => null);
   const result = await findAsset(job);
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it."));
@@ -39,14 +43,12 @@ export async function mountAsset(parent, job, named = () => {}) {
     const canvas = element("canvas", { class: "scene" });
     parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas),
       element("div", { class: "panel" }, element("p", { role: "status" }, `Loading ${bytes(result.size)} …`))));
-    const rig = viewOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; });
-    const poster = rig.then((view) => view?.card() ?? null).catch(() => null); // a view that an earlier build has made has none
     poster.then((picture) => picture !== null && showPoster(canvas, picture));
-    const [{ mount }, data, environments, view] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
+    const [{ mount }, data, environments, lights] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
       readyEnvironments(), rig]);
-    named(job.request.name || view?.info.name || job.id);
+    named(job.request.name || lights?.name || job.id);
     globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data },
-      { rig: view?.info ?? null, environments, load: loadEnvironment, poster: await poster });
+      { rig: lights, environments, load: loadEnvironment, poster: await poster });
   };
   if (result.size <= LARGE) {
     await show();

@@ -64,16 +64,12 @@ export class ViewFile {
 
   /** Return the thumbnails of the frames in one image. */
   thumbnails() {
-    return this.#picture("thumbnails.jpg");
+    return picture(this.#files, "thumbnails.jpg");
   }
 
   /** Return the object under a light from above right of the camera, a small picture. */
   card() {
-    return this.#picture("card.jpg");
-  }
-
-  async #picture(name) {
-    return createImageBitmap(new Blob([await this.#files.bytes(name)], { type: "image/jpeg" }));
+    return cardOf(this.#files);
   }
 
   /**
@@ -114,6 +110,15 @@ export class ViewFile {
     const found = await this.tile(layer, 0, Math.floor(row / tile) * Math.ceil(cols / tile) + Math.floor(col / tile));
     return found.planes.map((plane) => plane[(row % tile) * found.cols + (col % tile)]);
   }
+}
+
+/** Return the object under a light from above right of the camera, from the files of a view; an earlier build has made none. */
+export function cardOf(files) {
+  return picture(files, "card.jpg");
+}
+
+async function picture(files, name) {
+  return createImageBitmap(new Blob([await files.bytes(name)], { type: "image/jpeg" }));
 }
 
 function inflated(packed) {
