@@ -66,7 +66,7 @@ def find_translucency(given: SolveInput, lights: DistantLights, solution: Soluti
     darker = 0 if red < blue else 2
     sharper, width = 0.0, 0.0
     for span in SPANS:
-        edges = np.concatenate([_edges(ratio, span) for _, ratio in squares]) if squares else ()
+        edges = np.concatenate([_edges(ratio, span) for _, ratio in squares]) if squares else np.zeros((0, 4, 3))
         if len(edges) < LEAST_EDGES:
             continue
         inner, outer = np.median(edges[:, 2] - edges[:, 1], axis=0), np.median(edges[:, 3] - edges[:, 0], axis=0)
