@@ -195,6 +195,8 @@ class _Walk:
         settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
+        if settled.shown is not None:
+            self.result.facts["bounced_light"] = {"shown": round(settled.shown, 3), "taken_out": settled.light.arriving is not None}
         return settled.light
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:

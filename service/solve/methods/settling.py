@@ -61,6 +61,10 @@ SHOWN = 2.0
 """Bounced light over the noise floor at which a reading counts as showing it."""
 DECIDED = 0.4
 """Largest relative standard error at which the images decide the scale."""
+LEAST_SHOWN = 0.25
+"""Median of the light in shadows over that which the form factors expect, below which no light has bounced: images that were rendered or
+separated so. Form factors of a surface that was found from bounced light are at most a third off. Where albedo is found above 1, the light
+that is expected is as much too large, and the limit is lower."""
 
 
 class ScaleFit(NamedTuple):
@@ -160,18 +164,33 @@ class Settled(NamedTuple):
     scale: ScaleFit | None
     """None: it was not asked for, or the images do not decide it."""
 
+    shown: float | None
+    """Light in shadows over that which the surface would throw there, median; None: too few readings tell. Where it is little, the
+    light has no arriving part."""
+
     def report(self) -> dict[str, Any]:
         """Return what the report says about the scale of albedo."""
         if self.scale is None:
             return {"decided": False, "value": 1.0}
-        brightest = float(np.percentile(self.light.albedo[:, self.light.solved.numpy().reshape(-1) > 0].max(axis=0), BRIGHT_PERCENTILE))
-        value = min(self.scale.scale, LARGEST_ALBEDO / max(brightest, 1e-6))
+        value = min(self.scale.scale, _largest_scale(self.light))
         return {"decided": True, "value": round(value, 4), "sigma": round(max(self.scale.sigma, self.scale.scale - value), 4),
                 "from_shadows": round(self.scale.scale, 4), "stray_light": round(self.scale.stray, 5), "readings": self.scale.readings}
 
 
+def shown_bounce(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray, group: np.ndarray) -> float | None:
+    """Return the median of readings in shadow over the light that is expected there from other surfaces, with the arguments of
+    `fit_albedo_scale`, or None where too few readings tell: 1 where light bounces as expected, 0 in images without bounced light."""
+    behind = cosine < -LEAST_COSINE_BEHIND
+    cast = (cosine > LEAST_COSINE_CAST) & (ratio < DARK * DIRECT * cosine)
+    used = np.isfinite(ratio) & np.isfinite(arriving) & (behind | cast) & (arriving > SHOWN * NOISE_FLOOR)
+    groups, lights = np.broadcast_arrays(group[:, None], np.arange(ratio.shape[1]))
+    if used.sum() < LEAST_READINGS or min(len(np.unique(each[used])) for each in (groups, lights)) < LEAST_GROUPS:
+        return None
+    return float(np.median(ratio[used] / arriving[used]))
+
+
 def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
-    """Find the light that an object throws on itself from the surface without it.
+    """Find the light that an object throws on itself from the surface without it, unless its shadows show that there is none.
     `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
     positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     assert light.arriving is not None
@@ -180,8 +199,11 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     block, middles = _blocks(pixels, light.given.camera.width)
     first, albedo, start = normal, light.albedo, normal[:, middles].T
     turned, whole = start, readings_of(pick(middles))
+    shown = shown_bounce(*_in_shadow(light, middles, turned, whole))
+    if shown is not None and shown < LEAST_SHOWN * min(1.0, _largest_scale(light)):
+        return Settled(light._replace(arriving=None), None, shown)
     for _ in range(ROUNDS):
-        light = light._replace(albedo_scale=_value(_fit(light, middles, turned, whole)) if relative else 1.0)
+        light = light._replace(albedo_scale=_value(fit_albedo_scale(*_in_shadow(light, middles, turned, whole))) if relative else 1.0)
         samples = pick(middles)
         light.keep(middles, samples)
         turned = descend(samples, start, shape=shape).normal
@@ -190,8 +212,8 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
-    found = _fit(light, middles, turned, whole) if relative else None
-    return Settled(light._replace(albedo_scale=_value(found)), found)
+    found = fit_albedo_scale(*_in_shadow(light, middles, turned, whole)) if relative else None
+    return Settled(light._replace(albedo_scale=_value(found)), found, shown)
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -207,13 +229,20 @@ def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     return back, pixels[order[first]]
 
 
+def _largest_scale(light: DirectLight) -> float:
+    """Return the scale above which the bright pixels would send on more light than they get."""
+    brightest = float(np.percentile(light.albedo[:, light.solved.numpy().reshape(-1) > 0].max(axis=0), BRIGHT_PERCENTILE))
+    return LARGEST_ALBEDO / max(brightest, 1e-6)
+
+
 def _value(fit: ScaleFit | None) -> float:
     """Return the scale, or 1 where the images do not decide it."""
     return 1.0 if fit is None else fit.scale
 
 
-def _fit(light: DirectLight, pixels: np.ndarray, normal: np.ndarray, readings: np.ndarray) -> ScaleFit | None:
-    """Fit the scale of albedo at some pixels of known normals [n, 3] and readings [n, lights]."""
+def _in_shadow(light: DirectLight, pixels: np.ndarray, normal: np.ndarray,
+               readings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the arguments of `fit_albedo_scale` for some pixels of known normals [n, 3] and readings [n, lights]."""
     assert isinstance(light.arriving, ArrivingLight)
     weights = channel_weights(light.lights, GREY_WEIGHTS)
     albedo = light.albedo[:, pixels].T.astype(np.float64) * weights
@@ -225,7 +254,7 @@ def _fit(light: DirectLight, pixels: np.ndarray, normal: np.ndarray, readings: n
     square = max(light.given.mask.shape) / GROUPS
     group = (rows // square * (GROUPS + 1) + cols // square).astype(int)
     cosine = normal @ light.lights.direction[: readings.shape[1]].T
-    return fit_albedo_scale(ratio, arriving / np.maximum(grey, LEAST_ALBEDO), cosine, group)
+    return ratio, arriving / np.maximum(grey, LEAST_ALBEDO), cosine, group
 
 
 def _turn(normals: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:

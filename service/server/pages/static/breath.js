@@ -9,3 +9,8 @@ export async function breath() {
   await new Promise((resolve) => { setTimeout(resolve); });
   last = performance.now();
 }
+
+/** Return when what stands on the page is painted. */
+export function painted() {
+  return new Promise((resolve) => { requestAnimationFrame(() => setTimeout(resolve)); });
+}

@@ -35,25 +35,28 @@ export async function mountAsset(parent, job, named = () => {}) {
     .catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; });
   const poster = view.then((files) => (files === null ? null : cardOf(files))).catch(() => null);
   const result = await findAsset(job);
-  if (!canRender()) {
-    parent.replaceChildren(element("p", { class: "fault" }, "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it."));
-    return;
-  }
+  const canvas = element("canvas", { class: "scene" });
+  const panel = element("div", { class: "panel" });
+  parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas), panel));
   const show = async () => {
-    const canvas = element("canvas", { class: "scene" });
-    parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas),
-      element("div", { class: "panel" }, element("p", { role: "status" }, `Loading ${bytes(result.size)} …`))));
-    poster.then((picture) => picture !== null && showPoster(canvas, picture));
-    const [{ mount }, data, environments, lights] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
-      readyEnvironments(), rig]);
+    panel.replaceChildren(element("p", { role: "status" }, `Loading ${bytes(result.size)} …`));
+    const data = fetched(result.url, (answer) => answer.arrayBuffer());
+    data.catch(() => {}); // whoever waits for it is told
+    const picture = await poster;
+    if (picture !== null) await showPoster(canvas, picture); // before the graphics processor is waited for
+    if (!canRender()) {
+      parent.replaceChildren(element("p", { class: "fault" }, "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it."));
+      return;
+    }
+    const { mount } = await import("../scene/asset_viewer.js");
+    const [environments, lights] = await Promise.all([readyEnvironments(), rig]);
     named(job.request.name || lights?.name || job.id);
-    globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data },
-      { rig: lights, environments, load: loadEnvironment, poster: await poster });
+    globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data: await data }, { rig: lights, environments, load: loadEnvironment, poster: picture });
   };
   if (result.size <= LARGE) {
     await show();
     return;
   }
-  const button = element("button", { type: "button", onclick: () => { button.remove(); attempt(show); } }, `Load ${bytes(result.size)}`);
-  parent.replaceChildren(element("p", {}, `${result.name} is large: a browser needs several times its size as memory. `, button));
+  const button = element("button", { type: "button", onclick: () => attempt(show) }, `Load ${bytes(result.size)}`);
+  panel.replaceChildren(element("p", {}, `${result.name} is large: a browser needs several times its size as memory. `, button));
 }

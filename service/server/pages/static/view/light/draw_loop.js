@@ -4,7 +4,7 @@
  * drawn in bands, so that a new motion waits for one band at most.
  */
 
-const MOTION_MS = 25; // that a picture may take while something moves: thirty a second, with the rest of the page
+const MOTION_MS = 20; // that a picture may take while something moves: two frames of a screen, with what the next try may take longer
 const BAND_MS = 25; // that a band of a whole picture may take
 const STILL_MS = 150; // without a change, after which the whole picture is drawn
 const FIRST_PIXELS_PER_MS = 2000; // of a slow program on one core; the first drawings tell better

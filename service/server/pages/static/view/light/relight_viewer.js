@@ -1,6 +1,6 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
-import { breath } from "../../breath.js";
+import { breath, painted } from "../../breath.js";
 import { element, tell } from "../../element.js";
 import { ViewState } from "../../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
@@ -90,7 +90,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     front.getContext("2d").drawImage(picture, 0, 0);
     canvas.dataset.shown = "card";
     zoomed.draw(AROUND);
-    await new Promise((resolve) => { requestAnimationFrame(() => setTimeout(resolve)); });
+    await painted();
   }
 
   function move(direction) {
