@@ -67,11 +67,12 @@ def under_lamp(points: np.ndarray, lamp: np.ndarray, intensity: float) -> np.nda
     return intensity * cosine(points, way / length[..., None], length) / length**2
 
 
-def write_near(folder: Path, scene: Bowl, count: int, radii: float) -> Path:
-    """A capture under point lights on a cap around the bowl's centre."""
+def write_near(folder: Path, scene: Bowl, count: int, radii: float, *, bounced: bool = True) -> Path:
+    """A capture under point lights on a cap around the bowl's centre, with all bounces of light or none."""
     images, lights = [], []
     for lamp in radii * lattice(count, 75.0):
-        images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), under_lamp(WALL, lamp, radii**2).mean()))
+        arriving = under_lamp(WALL, lamp, radii**2).mean() if bounced else 0.0
+        images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), arriving))
         lights.append({"type": "point", "position_m": lamp.tolist(), "intensity": [radii**2] * 3})
     return write(folder, scene, images, lights)
 

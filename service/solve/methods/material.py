@@ -36,7 +36,7 @@ from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.parts import Material
 from service.solve.methods.diffuse import APART, pair_starts
-from service.solve.methods.settling import settle
+from service.solve.methods.settling import as_shown, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
 from stage.colour.colour import GREY_WEIGHTS
 
@@ -62,7 +62,7 @@ class MaterialOptions:
     interreflection: bool = True
     """Subtract the light that the object throws on itself."""
     settling: bool = True
-    """Find that light again from the surface without it."""
+    """Find that light again from the surface without it, or leave it where shadows show none."""
     scale: bool = True
     """Choose the scale of albedo from the images where that of the lights is unknown."""
     intensities: bool = True
@@ -189,14 +189,17 @@ class _Walk:
         light = direct_light(self._given, self._lights, self._field, self.result.normal, material, self._bouncing, solved,
                              shadows=self._options.shadows, interreflection=self._interreflection,
                              parts=self._options.parts and self._interreflection)
-        if light is None or light.arriving is None or self._field is not None or not (self._supported and self._options.settling):
+        if light is None or light.arriving is None or not self._options.settling:
+            return light
+        light, shown = as_shown(light, self.result.normal, self._pick)
+        if shown is not None:
+            self.result.facts["bounced_light"] = {"shown": round(shown, 3), "taken_out": light.arriving is not None}
+        if light.arriving is None or self._field is not None or not self._supported:
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
         settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
-        if settled.shown is not None:
-            self.result.facts["bounced_light"] = {"shown": round(settled.shown, 3), "taken_out": settled.light.arriving is not None}
         return settled.light
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:

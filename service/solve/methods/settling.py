@@ -2,15 +2,10 @@
 
 Bounced light makes hollows look shallower, so that the first search underestimates form factors, and its albedo contains the bounce. One
 pixel of each block is searched again in its direct light; what this changes is carried over to the block, and the arriving light follows
-anew. Where the scale of the lights is unknown, the scale of albedo is chosen from the images in each round.
+anew. Where the scale of the lights is unknown, the scale of albedo is chosen from the images in each round. Where shadows show no bounced
+light, none is taken out at all.
 
-A reading in shadow is s ρ A + a ρ: the albedo ρ found so far times its unknown scale s and the light A that arrives from the other
-surfaces, and stray light a that reaches every pixel. Both ρ and A are proportional to readings, so that bounced light is quadratic in their
-scale and direct light is linear: the ratio tells the scale. Lit readings hardly do, because normals and lobes imitate bounced light there.
-
-Sources: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 4: shape and interreflection are corrected in turn;
-the robust regression is re-weighted least squares, Holland and Welsch, Communications in Statistics 1977; its covariance sums over groups
-of pixels and over lights whose errors are alike, Cameron, Gelbach and Miller, "Robust inference with multiway clustering", JBES 2011.
+Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 4: shape and interreflection are corrected in turn.
 """
 
 import math
@@ -19,142 +14,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.photometric.lambertian.readings import channel_weights
 from kernels.photometric.model.samples import Samples, readings_of
 from kernels.photometric.search.descent import descend
 from kernels.photometric.search.hypotheses import Diffuse
-from kernels.spread import MAD_TO_SIGMA
-from service.solve.height.direct_light import LARGEST_ALBEDO, DirectLight
-from service.solve.height.interreflection import ArrivingLight, arriving_light
-from stage.colour.colour import GREY_WEIGHTS
-
-LEAST_COSINE_BEHIND = 0.1
-"""A light this far behind the tangent plane (cosine below its negative) does not reach a pixel, whose normal may be wrong by 5°."""
-LEAST_COSINE_CAST = 0.2
-"""Least cosine of a light that casts a shadow on a pixel: below it, dark readings may be grazing light."""
-DARK = 0.3
-"""A reading is in cast shadow if it differs from its bounced light by less than this part of the direct light that the pixel would have."""
-LIT = 0.6
-"""A reading above this part of that direct light is never taken for a shadow."""
-DIRECT = 1 / math.pi
-"""Direct light of a surface of albedo 1 that faces a light, per irradiance."""
-NOISE_FLOOR = 0.003
-"""Noise of a reading over its albedo, 1 % of the direct light: smaller bounced light does not count."""
-RELATIVE_NOISE = 0.3
-"""Relative error of the arriving light at a pixel: patches are coarse, and not every surface is seen."""
-CUTOFF = 2.0
-"""Residual over its standard deviation at which the weight is one half."""
-FIT_ROUNDS = 30
-"""Most rounds of re-weighting."""
-CONVERGED = 1e-3
-"""Relative change of the scale that ends the rounds."""
-MODEL_ERROR = 0.08
-"""Relative error of the arriving light that all pixels share: the median on path-traced surfaces. Surfaces that the camera does not see
-and gloss at grazing angles add light, so that the largest errors are too large scales."""
-MOST_STRAY = 0.01
-"""Most stray light, 3 % of the direct light: in a hollow that bounces evenly, stray light and bounced light look the same."""
-LEAST_GROUPS = 5
-"""Least number of groups of pixels, and of lights, that must show bounced light."""
-LEAST_READINGS = 50
-"""Least number of readings in shadow."""
-SHOWN = 2.0
-"""Bounced light over the noise floor at which a reading counts as showing it."""
-DECIDED = 0.4
-"""Largest relative standard error at which the images decide the scale."""
-LEAST_SHOWN = 0.25
-"""Median of the light in shadows over that which the form factors expect, below which no light has bounced: images that were rendered or
-separated so. Form factors of a surface that was found from bounced light are at most a third off. Where albedo is found above 1, the light
-that is expected is as much too large, and the limit is lower."""
-
-
-class ScaleFit(NamedTuple):
-    """The scale of albedo with its uncertainty."""
-
-    scale: float
-    """Albedo of the surface over the albedo that was given."""
-    sigma: float
-    """Standard error of the scale."""
-    stray: float
-    """Stray light: reading over albedo where no bounced light arrives, per irradiance."""
-    readings: int
-    """Number of readings in shadow."""
-
-
-def fit_albedo_scale(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray, group: np.ndarray) -> ScaleFit | None:
-    """Fit the scale of albedo to the readings in shadow.
-
-    Args:
-        ratio: [n, lights] float64, reading over albedo, per irradiance; NaN where there is no reading.
-        arriving: [n, lights] float64, reading over albedo that the light from other surfaces causes at albedo 1.
-        cosine: [n, lights] of the angle between normal and light.
-        group: [n] int, pixels near each other, whose errors are alike.
-
-    Returns:
-        The fit, or None where the images do not decide the scale.
-    """
-    given = np.isfinite(ratio) & np.isfinite(arriving)
-    behind = given & (cosine < -LEAST_COSINE_BEHIND)
-    lit = DIRECT * cosine
-    facing = given & (cosine > LEAST_COSINE_CAST) & (ratio < LIT * lit)
-    groups, lights = np.broadcast_arrays(group[:, None], np.arange(ratio.shape[1]))
-    scale, stray = 1.0, 0.0
-    for _ in range(FIT_ROUNDS):
-        direct = ratio - stray - scale * arriving
-        used = behind | (facing & (np.abs(direct) < DARK * lit))
-        y, x = ratio[used], arriving[used]
-        if len(y) < LEAST_READINGS:
-            return None
-        residual = y - stray - scale * x
-        dim = x <= np.median(x)
-        floor = NOISE_FLOOR + MAD_TO_SIGMA * float(np.median(np.abs(residual[dim])))
-        variance = floor**2 + (RELATIVE_NOISE * scale * x) ** 2
-        weight = 1 / (variance * (1 + residual**2 / (CUTOFF**2 * variance)))
-        design = np.stack([x, np.ones_like(x)], axis=1)
-        gram = (design * weight[:, None]).T @ design
-        before = scale
-        if np.linalg.cond(gram / np.sqrt(np.outer(np.diag(gram) + 1e-30, np.diag(gram) + 1e-30))) > 1e6:
-            return None
-        scale, stray = np.linalg.solve(gram, (design * weight[:, None]).T @ y)
-        bounded = not 0 <= stray <= MOST_STRAY
-        if bounded:
-            stray = min(max(stray, 0.0), MOST_STRAY)
-            scale = float((weight * x * (y - stray)).sum() / (weight * x * x).sum())
-        if scale <= 0:
-            return None
-        if abs(scale - before) < CONVERGED * scale:
-            break
-    shows = scale * x > SHOWN * NOISE_FLOOR
-    if min(len(np.unique(each[used][shows])) for each in (groups, lights)) < LEAST_GROUPS:
-        return None
-    score = design * (weight * (y - stray - scale * x))[:, None]
-    inverse = np.diag([1 / gram[0, 0], 0.0]) if bounded else np.linalg.inv(gram)
-    apart = [_variance(score, inverse, labels) for labels in (groups[used], lights[used], np.arange(len(y)))]
-    spread = max(apart[0] + apart[1] - apart[2], apart[0], apart[1])
-    unknown = MOST_STRAY / 2 * float((weight * x).sum() / (weight * x * x).sum()) if bounded and stray > 0 else 0.0
-    sigma = math.sqrt(spread + unknown**2 + (MODEL_ERROR * scale) ** 2)
-    return ScaleFit(float(scale), sigma, float(stray), len(y)) if sigma < DECIDED * scale else None
-
-
-def _variance(score: np.ndarray, inverse: np.ndarray, label: np.ndarray) -> float:
-    """Return the variance of the scale where readings of one label err alike; `score` [readings, 2] are derivatives of the cost."""
-    numbers = np.unique(label, return_inverse=True)[1]
-    sums = np.stack([np.bincount(numbers, weights=column) for column in score.T], axis=1)
-    count = len(sums)
-    return float((inverse @ (sums.T @ sums) @ inverse)[0, 0]) * count / max(count - 1, 1)
-
+from service.solve.height.direct_light import DirectLight
+from service.solve.height.interreflection import arriving_light
+from service.solve.methods.shadow_light import ScaleFit, fit_albedo_scale, has_bounced, largest_scale, readings_in_shadow, shown_bounce
 
 BLOCKS = 2500
 """Most pixels that are searched again, each for a square block around it."""
 ROUNDS = 2
 """Rounds: the third changes the scale of albedo by 1 %."""
-LEAST_ALBEDO = 0.02
-"""Pixels of less albedo say nothing of its scale: what they send on is mostly stray or specular."""
-GROUPS = 12
-"""Number of squares along the longer side of the image; the readings of a square err alike."""
 SHADOW_PART = 0.1
 """Part of the mean of a pixel's readings below which a reading is not lit."""
-BRIGHT_PERCENTILE = 95.0
-"""Percentile of the albedo, over pixels and channels, that must stay below 1."""
 
 
 class Settled(NamedTuple):
@@ -164,33 +36,25 @@ class Settled(NamedTuple):
     scale: ScaleFit | None
     """None: it was not asked for, or the images do not decide it."""
 
-    shown: float | None
-    """Light in shadows over that which the surface would throw there, median; None: too few readings tell. Where it is little, the
-    light has no arriving part."""
-
     def report(self) -> dict[str, Any]:
         """Return what the report says about the scale of albedo."""
         if self.scale is None:
             return {"decided": False, "value": 1.0}
-        value = min(self.scale.scale, _largest_scale(self.light))
+        value = min(self.scale.scale, largest_scale(self.light))
         return {"decided": True, "value": round(value, 4), "sigma": round(max(self.scale.sigma, self.scale.scale - value), 4),
                 "from_shadows": round(self.scale.scale, 4), "stray_light": round(self.scale.stray, 5), "readings": self.scale.readings}
 
 
-def shown_bounce(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray, group: np.ndarray) -> float | None:
-    """Return the median of readings in shadow over the light that is expected there from other surfaces, with the arguments of
-    `fit_albedo_scale`, or None where too few readings tell: 1 where light bounces as expected, 0 in images without bounced light."""
-    behind = cosine < -LEAST_COSINE_BEHIND
-    cast = (cosine > LEAST_COSINE_CAST) & (ratio < DARK * DIRECT * cosine)
-    used = np.isfinite(ratio) & np.isfinite(arriving) & (behind | cast) & (arriving > SHOWN * NOISE_FLOOR)
-    groups, lights = np.broadcast_arrays(group[:, None], np.arange(ratio.shape[1]))
-    if used.sum() < LEAST_READINGS or min(len(np.unique(each[used])) for each in (groups, lights)) < LEAST_GROUPS:
-        return None
-    return float(np.median(ratio[used] / arriving[used]))
+def as_shown(light: DirectLight, normal: np.ndarray, pick: Callable[[np.ndarray], Samples]) -> tuple[DirectLight, float | None]:
+    """Return the light of a first search without its arriving part where shadows show none; and what they show, of `shown_bounce`.
+    `normal`: [3, pixels], as for `settle`, as `pick` is."""
+    middles = _blocks(np.flatnonzero(light.solved.numpy() > 0), light.given.camera.width)[1]
+    shown = shown_bounce(*readings_in_shadow(light, middles, normal[:, middles].T, readings_of(pick(middles))))
+    return (light if has_bounced(light, shown) else light._replace(arriving=None)), shown
 
 
 def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
-    """Find the light that an object throws on itself from the surface without it, unless its shadows show that there is none.
+    """Find the light that an object throws on itself from the surface without it.
     `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
     positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     assert light.arriving is not None
@@ -199,11 +63,9 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     block, middles = _blocks(pixels, light.given.camera.width)
     first, albedo, start = normal, light.albedo, normal[:, middles].T
     turned, whole = start, readings_of(pick(middles))
-    shown = shown_bounce(*_in_shadow(light, middles, turned, whole))
-    if shown is not None and shown < LEAST_SHOWN * min(1.0, _largest_scale(light)):
-        return Settled(light._replace(arriving=None), None, shown)
     for _ in range(ROUNDS):
-        light = light._replace(albedo_scale=_value(fit_albedo_scale(*_in_shadow(light, middles, turned, whole))) if relative else 1.0)
+        fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole)) if relative else None
+        light = light._replace(albedo_scale=_value(fit))
         samples = pick(middles)
         light.keep(middles, samples)
         turned = descend(samples, start, shape=shape).normal
@@ -212,8 +74,8 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
-    found = fit_albedo_scale(*_in_shadow(light, middles, turned, whole)) if relative else None
-    return Settled(light._replace(albedo_scale=_value(found)), found, shown)
+    found = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole)) if relative else None
+    return Settled(light._replace(albedo_scale=_value(found)), found)
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -229,32 +91,9 @@ def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     return back, pixels[order[first]]
 
 
-def _largest_scale(light: DirectLight) -> float:
-    """Return the scale above which the bright pixels would send on more light than they get."""
-    brightest = float(np.percentile(light.albedo[:, light.solved.numpy().reshape(-1) > 0].max(axis=0), BRIGHT_PERCENTILE))
-    return LARGEST_ALBEDO / max(brightest, 1e-6)
-
-
 def _value(fit: ScaleFit | None) -> float:
     """Return the scale, or 1 where the images do not decide it."""
     return 1.0 if fit is None else fit.scale
-
-
-def _in_shadow(light: DirectLight, pixels: np.ndarray, normal: np.ndarray,
-               readings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the arguments of `fit_albedo_scale` for some pixels of known normals [n, 3] and readings [n, lights]."""
-    assert isinstance(light.arriving, ArrivingLight)
-    weights = channel_weights(light.lights, GREY_WEIGHTS)
-    albedo = light.albedo[:, pixels].T.astype(np.float64) * weights
-    grey = albedo.sum(axis=1)[:, None]
-    rows, cols = np.divmod(pixels, light.given.camera.width)
-    corners, shares = light.arriving.at(rows, cols)
-    arriving = np.einsum("nc,nk,nkcl->nl", albedo, shares, light.arriving.light[corners], optimize=True)
-    ratio = np.where((readings >= 0) & (grey > LEAST_ALBEDO), readings.astype(np.float64) / np.maximum(grey, LEAST_ALBEDO), np.nan)
-    square = max(light.given.mask.shape) / GROUPS
-    group = (rows // square * (GROUPS + 1) + cols // square).astype(int)
-    cosine = normal @ light.lights.direction[: readings.shape[1]].T
-    return ratio, arriving / np.maximum(grey, LEAST_ALBEDO), cosine, group
 
 
 def _turn(normals: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.requests.solve import SolveRequest
-from service.solve.methods.settling import fit_albedo_scale, shown_bounce
+from service.solve.methods.shadow_light import fit_albedo_scale, shown_bounce
 from service.solve.solve import solve
 from tests.kernels.scenes import cap
 from tests.reference.groove import Groove
