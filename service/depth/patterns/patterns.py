@@ -25,6 +25,7 @@ from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
 from service.depth.patterns.wave_checks import bent_back, check_waves
+from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -183,13 +184,15 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     wrong = wrong or waves.wrong
     if wrong is not None:
         return Checks([wrong], codes, False)
+    bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or shown._replace(
+        exponent=find_exponent(sample, codes.collected, shown, noise, device))
+    wrong = check_range(sample, codes.collected, bent, noise)
+    if wrong is not None:
+        return Checks([wrong], codes, False)
     said = [] if waves.unconfirmed is None else [waves.unconfirmed]
-    if shown.response is None:
-        bent = bent_back(sample, codes.collected, shown, noise) or shown._replace(
-            exponent=find_exponent(sample, codes.collected, shown, noise, device))
-        if bent.exponent != 1.0:
-            names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-            return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
+    if bent.exponent != shown.exponent:
+        names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
+        return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
     return Checks(said, codes, True)
 
 

@@ -147,8 +147,9 @@ def some_of(waves: Waves, count: int) -> tuple[np.ndarray, np.ndarray]:
     return waves.turns.reshape(len(waves.periods), -1)[:, at], waves.deviation.ravel()[at]
 
 
-def joint_misfit(turns: np.ndarray, periods: np.ndarray, extent: float) -> np.ndarray:
-    """Return the misfit of phases [periods, pixels] at the place of the projector that fits best, turns per degree of freedom, [pixels]."""
+def joint_fit(turns: np.ndarray, periods: np.ndarray, extent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the misfit of phases [periods, pixels] at the place of the projector that fits best, turns per degree of freedom, and that
+    place, pixels; each [pixels]."""
     frequency = 1 / periods
     shortest = int(np.argmin(periods))
     wraps = np.arange(-1, int(np.ceil(extent / periods[shortest])) + 1)
@@ -159,7 +160,10 @@ def joint_misfit(turns: np.ndarray, periods: np.ndarray, extent: float) -> np.nd
     squares = (rest**2).sum(axis=0) - slope**2 * (frequency @ frequency)
     border = 0.05 * periods[shortest]
     inside = (place - slope >= -border) & (place - slope <= extent + border)
-    return np.sqrt(np.maximum(np.where(inside, squares, 1.0), 0).min(axis=0) / (len(periods) - 1))
+    squares = np.maximum(np.where(inside, squares, 1.0), 0)
+    best = squares.argmin(axis=0)[None]
+    least, where = (np.take_along_axis(each, best, axis=0)[0] for each in (squares, place - slope))
+    return np.sqrt(least / (len(periods) - 1)), where
 
 
 def _check_several(waves: Waves) -> str | None:
@@ -167,7 +171,7 @@ def _check_several(waves: Waves) -> str | None:
     turns, deviation = some_of(waves, SOME)
 
     def misfit(shown: np.ndarray, periods: np.ndarray, bends: tuple[float, ...] = BENDS) -> float:
-        return min(float(np.median(joint_misfit(shown + bend * np.sin(2 * np.pi * waves.steps * shown), periods, waves.extent)))
+        return min(float(np.median(joint_fit(shown + bend * np.sin(2 * np.pi * waves.steps * shown), periods, waves.extent)[0]))
                    for bend in bends)
 
     declared, noise = misfit(turns, waves.periods), float(np.median(deviation))
@@ -341,4 +345,4 @@ def _fit(sample: Sample, code: PhaseCode, projector: PatternProjector, exponent:
     if waves is None:
         return None
     turns, deviation = some_of(waves, SOME)
-    return float(np.median(joint_misfit(turns, waves.periods, waves.extent))), float(np.median(deviation))
+    return float(np.median(joint_fit(turns, waves.periods, waves.extent)[0])), float(np.median(deviation))

@@ -9,6 +9,7 @@ from kernels.structured.triangulate import ProjectorModel
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import Sample
 from service.depth.patterns.wave_checks import bent_back, check_waves
+from service.depth.patterns.wave_range import check_range
 from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns
 
@@ -32,8 +33,8 @@ def seen(side=1, field=0.42):
     return x, y, np.where((u >= 0) & (u < EXTENT), u, np.nan)
 
 
-def said(patterns, declared, *, side=1, field=0.42, gamma=1.0, calibrated=True):
-    """Both sentences about frames of these patterns."""
+def frames_of(patterns, *, side=1, field=0.42, gamma=1.0):
+    """What a camera records of these patterns, as a sample."""
     rng = np.random.default_rng(7)
     x, y, u = seen(side, field)
     albedo = 0.55 + 0.35 * np.sign(np.sin(60 * x) * np.sin(50 * y))
@@ -42,9 +43,12 @@ def said(patterns, declared, *, side=1, field=0.42, gamma=1.0, calibrated=True):
                       for pattern in patterns])
     frames = albedo * (0.75 * light + 0.04)
     frames = frames + rng.normal(0, 1, frames.shape) * np.sqrt(NOISE.read**2 + NOISE.gain * frames)
-    sample = Sample(frames.reshape(len(frames), 1, -1).astype(np.float32), None, x.astype(np.float32), y.astype(np.float32),
-                    np.isfinite(u))
-    projector = PatternProjector((EXTENT, ROW_EXTENT))
+    return Sample(frames.reshape(len(frames), 1, -1).astype(np.float32), None, x.astype(np.float32), y.astype(np.float32), np.isfinite(u))
+
+
+def said(patterns, declared, *, calibrated=True, side=1, **seen_as):
+    """Both sentences about frames of these patterns."""
+    sample, projector = frames_of(patterns, side=side, **seen_as), PatternProjector((EXTENT, ROW_EXTENT))
     found = check_waves(sample, collect(list(declared)), projector, rig(side) if calibrated else None, NOISE)
     return (*found, bent_back(sample, collect(list(declared)), projector, NOISE))
 
@@ -118,3 +122,17 @@ def test_bent_waves_are_bent_back_by_the_exponent_that_makes_them_agree(gamma):
     wrong, _, found = said(THREE, THREE, gamma=gamma)
     assert wrong is None and found.exponent == pytest.approx(gamma, abs=0.051) and found.left_rad < 0.03
     assert "if their steps run backwards" in said(THREE, reversed_steps(THREE), gamma=gamma)[0]
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.8])
+@pytest.mark.parametrize("declared", [250, 320, EXTENT, 500])
+def test_waves_that_go_on_beyond_the_projector_are_named(declared, gamma):
+    """A projector of 400 columns, seen from about 20 to 390; the waves repeat after 5 434."""
+    sample, projector = frames_of(THREE, gamma=gamma), PatternProjector((declared, ROW_EXTENT))
+    bent = bent_back(sample, collect(list(THREE)), projector, NOISE) or projector
+    found = check_range(sample, collect(list(THREE)), bent, NOISE)
+    if declared >= EXTENT:
+        assert found is None
+    else:
+        assert found is not None and f"beyond the {declared} columns" in found and "projector.resolution" in found
+        assert 330 < float(found.split("about ")[1].split(":")[0]) <= EXTENT
