@@ -4,6 +4,8 @@ A bit is the sign of d = I - Ī (with inverses) or d = I - (white + black)/2. It
 own noise or DOUBT_PART of the contrast: at edges, and where stripes are finer than camera or projector resolve. Up to two
 doubtful bits are tried both ways; where all readings lie within MAX_SPREAD + 1 neighbouring stripes (at an edge of a Gray code
 always: there one bit changes) their middle is the result, with the deviation of the whole range; otherwise the pixel is UNDECIDED.
+At an edge of a plain binary code a bit and all finer ones change (a carry): where these and no other are faint, that edge is the place.
+Where they are among the FINE_BITS finest, they may as well be too fine to be seen, and the deviation is that of all stripes they number.
 Up to MAX_OPEN of the finest bits of a Gray code may be in doubt besides: the stripes that they tell apart are then one wide stripe.
 
 Light that reaches the pixel by other ways (fog, bounces, light below the surface) follows wide stripes as direct light does, and narrow
@@ -40,6 +42,10 @@ than noise decides."""
 MAX_OPEN = 2
 """Number of the finest bits that may be in doubt without the pixel being refused: a camera that resolves stripes a quarter as fine as those
 that are shown sees no more."""
+FAINT_PART = 0.25
+"""Difference below which a bit may change at the place of a pixel, as a part of the contrast: finer bits of a carry are dimmer by blur."""
+FAINT_LIMITS = 2.0
+"""The same in limits of doubt, where noise is larger."""
 FINE_BITS = 3
 """Number of the finest bits that tell direct light."""
 MUCH_STRAY = 0.5
@@ -154,15 +160,23 @@ def proven_gray(d: float, stray: float, finest: float, contrast: float, limit: f
 
 @wp.func
 def proven_binary(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
-    """Return the same for plain binary code: at a carry all bits that change are as faint as the finest, whose difference is given."""
+    """Return the same for plain binary code: at a carry all bits that change are as faint as the finest, whose difference is given, and the
+    others hold all light, to the limit of doubt, whose square is given."""
     off = d - finest
-    return d >= stray or stray < MUCH_STRAY * contrast or off * off < 4.0 * wp.max(limit, 0.01 * contrast * contrast)
+    return d + wp.sqrt(limit) >= stray or stray < MUCH_STRAY * contrast or off * off < 4.0 * wp.max(limit, 0.01 * contrast * contrast)
 
 
 @wp.func
 def proven_xor(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
     """Return the same for XOR code: other light hardly follows its stripes, which are all narrow, unless nearly all is other light."""
     return stray < MUCH_STRAY * contrast
+
+
+@wp.func
+def carry_of(doubt: int, open: int, faint: int) -> int:
+    """Return the faint bits of a plain binary code if they are those that change at a carry, one and all finer ones; else 0."""
+    carries = faint >= 3 and (faint & (faint + 1)) == 0 and doubt != 0 and ((doubt | open) & ~faint) == 0
+    return wp.where(carries, faint, 0)
 
 
 _NUMBERS = {"binary": (number_binary, proven_binary), "gray": (number_gray, proven_gray), "xor": (number_xor, proven_xor)}
@@ -172,7 +186,7 @@ _NUMBERS = {"binary": (number_binary, proven_binary), "gray": (number_gray, prov
 def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", inverses: bool = True, references: bool = True) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     number_of, proven = _NUMBERS[code]
-    narrow = code == "xor"
+    narrow, plain = code == "xor", code == "binary"
     first_open = 0 if narrow else FINE_BITS - 1  # finer bits show direct light
     cut_of = cut_in(pack)
 
@@ -230,7 +244,7 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
             stray[k] = wp.max(contrast[k] - 2.0 * stray[k], 0.0)
         noise_part = wp.static(2.0 * DOUBT_SIGMAS**2) * read_variance
         gain_part = wp.static(DOUBT_SIGMAS**2) * gain
-        shown, doubt, open = int_pack(), int_pack(), int_pack()
+        shown, doubt, open, faint = int_pack(), int_pack(), int_pack(), int_pack()
         for bit in range(rows.shape[0]):
             flag = 1 << bit
             one = values[rows[bit, 0], p]
@@ -244,6 +258,9 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
                     sure = bit < wp.static(first_open) or proven(wp.abs(d), stray[k], finest[k], contrast[k], limit)
                     open[k] = open[k] + wp.where(sure, 0, flag)
+                    if wp.static(plain):
+                        part = wp.static(FAINT_PART) * contrast[k]
+                        faint[k] = faint[k] + wp.where(d * d >= wp.max(wp.static(FAINT_LIMITS**2) * limit, part * part), 0, flag)
             else:
                 for k in range(pack):
                     d = one[k] - middle[k]
@@ -254,12 +271,22 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
                     sure = bit < wp.static(first_open) or proven(2.0 * wp.abs(d), stray[k], finest[k], contrast[k], 4.0 * limit)
                     open[k] = open[k] + wp.where(sure, 0, flag)
+                    if wp.static(plain):
+                        part = wp.static(0.5 * FAINT_PART) * contrast[k]
+                        faint[k] = faint[k] + wp.where(d * d >= wp.max(wp.static(FAINT_LIMITS**2) * limit, part * part), 0, flag)
         u, error, signal, result = float_pack(), float_pack(), float_pack(), byte_pack()
         for k in range(pack):
-            doubtful = doubt[k] | open[k]
+            carry = int(0)  # noqa: RUF046 - declares a variable that a branch may change
+            if wp.static(plain):
+                carry = carry_of(doubt[k], open[k], faint[k])
+            edge = shown[k] - (shown[k] & carry) + ((carry + 1) >> 1)  # the stripe after it
+            doubtful = (doubt[k] | open[k]) & ~carry
             left = int(0)  # noqa: RUF046 - declares a variable that a Warp loop may change
             for bit in range(free):
                 left = left + wp.where(left == bit, (doubtful >> bit) & 1, 0)
+            if carry < wp.static(1 << FINE_BITS):
+                for bit in range(wp.static(FINE_BITS)):
+                    left = left + ((carry >> bit) & 1)
             above_left = (doubtful >> left) << left
             low = above_left & (-above_left)
             rest = above_left & (above_left - 1)
@@ -276,9 +303,10 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                 contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k])
             loose = wp.min(wp.max(wp.static(DOUBT_SIGMAS) * wp.sqrt(spread[k]), stray[k]) / wp.max(contrast[k], 1.0e-20), 1.0)
             code, place, deviation = place_stripe(
-                cut[k], lit, (rest & (rest - 1)) == 0, (more & (more - 1)) != 0, read >> left,
-                number_of(shown[k] ^ low, base_bit, above) >> left, number_of(shown[k] ^ second, base_bit, above) >> left,
-                number_of(shown[k] ^ low ^ second, base_bit, above) >> left, 1 << left, MAX_SPREAD, loose,
+                cut[k], lit, (rest & (rest - 1)) == 0, (more & (more - 1)) != 0, wp.where(carry > 0, edge - 1, read) >> left,
+                wp.where(carry > 0, edge, number_of(shown[k] ^ low, base_bit, above)) >> left,
+                wp.where(carry > 0, edge, number_of(shown[k] ^ second, base_bit, above)) >> left,
+                wp.where(carry > 0, edge, number_of(shown[k] ^ low ^ second, base_bit, above)) >> left, 1 << left, MAX_SPREAD, loose,
                 most - least + 1, stripe, extent)
             u[k] = place
             error[k] = deviation

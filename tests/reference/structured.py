@@ -36,6 +36,9 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
     shown = difference > 0
     limit = np.maximum(doubt**2 * own, small**2)
     doubtful = ~(difference**2 >= limit)
+    faint = ~(difference**2 >= np.maximum(4 * limit, (contrast / 4 / factor)**2))
+    highest = np.where(faint.any(axis=0), n - 1 - faint[::-1].argmax(axis=0), -1)
+    uncertain = doubtful.any(axis=0)
     size = factor * np.abs(difference)
     alone = size.max(axis=0) if code == "xor" or n == 1 else np.max([(a + b) / 2 for a, b in itertools.pairwise(size[:3])], axis=0)
     stray = np.maximum(contrast - 2 * alone, 0)
@@ -44,14 +47,22 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
     else:
         unproven = ~(size >= stray) & (np.arange(n) >= 2)[:, None]
         if code == "binary":
-            unproven = unproven & ~(stray < 0.5 * contrast) & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2))
+            unproven = (unproven & ~(size + factor * np.sqrt(limit) >= stray) & ~(stray < 0.5 * contrast)
+                        & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2)))
     doubtful = doubtful | unproven
+    carry = ((faint == (np.arange(n)[:, None] <= highest)).all(axis=0) & (highest >= 1) & uncertain & ~(doubtful & ~faint).any(axis=0)
+             & (code == "binary"))
     free = min(free, {"binary": 0, "gray": n - 1, "xor": base_bit}[code])
     loose = np.minimum(np.maximum(doubt * np.sqrt(variance), stray) / np.maximum(contrast, 1e-20), 1)
     least, most, status = np.zeros(pixels, int), np.zeros(pixels, int), np.full(pixels, "OK", dtype=object)
     for p in range(pixels):
         if not (contrast[p] > 0 and contrast[p] ** 2 >= shadow**2 * variance[p]):
             status[p] = "SHADOWED"
+            continue
+        if carry[p]:
+            wide = 1 << (highest[p] + 1)
+            edge = sum(int(b) << i for i, b in enumerate(shown[:, p])) // wide * wide + wide // 2
+            least[p], most[p] = (edge - wide // 2, edge + wide // 2 - 1) if wide <= 8 else (edge - 1, edge)
             continue
         left = 0
         while left < free and doubtful[left, p]:
