@@ -21,6 +21,7 @@ from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
+from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
@@ -112,6 +113,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                 timings.advance(band.stop)
             if declared:
                 warnings += widen_lagging(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)[0]
+                widen_mixed(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
                                      declared=declared)
@@ -172,8 +174,7 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
 
 
 def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
-             capture: Capture, frames: list[Frame], noise: NoiseModel, device: str,
-             request: DepthRequest) -> Checks:
+             capture: Capture, frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> Checks:
     """Judge the declaration by a sample of the frames."""
     sample = sample_of(planes, capture.camera, mask)
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
@@ -261,7 +262,7 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
     lagging: list[str] = []
     if declared:
         lagging, wider = widen_lagging(planes, coordinates, (columns, rows), codes.collected, noise)
-        maps["sigma"] *= wider
+        maps["sigma"] *= wider * widen_mixed(planes, coordinates, (columns, rows), codes.collected, noise)
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
             missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector

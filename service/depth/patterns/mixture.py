@@ -1,0 +1,85 @@
+"""Pixels that see two surfaces at once, at thin things and silhouettes: the phase of a wave is a mixture there, of neither.
+
+Stripes of a Gray or binary code tell such pixels. At an edge one bit of a Gray code lies between dark and bright; where the stripes of two
+surfaces are mixed, every bit by which their numbers differ does, by the part of the light that comes from either. Several periods
+contradict each other there; a single one, numbered by stripes, does not, and its place is off by what the smaller part turns the phase.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.coordinates import AxisMaps, Coordinates
+from service.depth.patterns.decoders import AxisDecoder
+from stage.colour.colour import GREY_WEIGHTS
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.phase import PhaseCode
+from stage.stack.planes import Planes
+
+LEAST_BITS = 3
+"""Least number of bits whose stripes are at least half as wide as the period: two of them may differ between the surfaces."""
+CLEAR_SIGMAS = 3.0
+"""Standard deviations by which a bit must lie below the usual ones, so that a part is not one of noise."""
+TURN = 0.9
+"""Standard deviation of a phase to which a part f of the light, over the rest, adds another phase, times f / (1 - f): between small parts,
+where it is .71, and halves of any two phases, where it is .91."""
+BYTES_PER_PIXEL = 400
+"""Memory that this takes for each pixel of a band."""
+
+
+def widen_mixed(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
+                noise: NoiseModel) -> np.ndarray:
+    """Add to the deviations of places what a second surface in the pixel may make; return the factor by which that widens the depth's,
+    [rows, cols]. `decoders`: of columns and of rows."""
+    wider = np.ones_like(coordinates.amplitude)
+    for decoder, axis in zip(decoders, (coordinates.columns, coordinates.rows), strict=True):
+        part = None if decoder is None or axis is None else _mixed_part(planes, axis, decoder, collected, noise)
+        if part is None or axis is None or decoder is None:
+            continue
+        period = min(next(code for code in decoder.used if isinstance(code, PhaseCode)).periods_px)
+        off = TURN * part / (1 - part) * period / (2 * np.pi)
+        sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, off), 0)
+        wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
+        axis.sigma[:] = sigma
+    return wider
+
+
+def _mixed_part(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> np.ndarray | None:
+    """Return the part of the light of each pixel that comes from a second surface, [rows, cols] 0…0.5; None where the code cannot tell."""
+    phase = next((code for code in decoder.used if isinstance(code, PhaseCode)), None)
+    stripes = next((code for code in decoder.used if isinstance(code, BinaryCode) and code.name != "xor"), None)
+    if phase is None or stripes is None or len(set(phase.periods_px)) > 1:
+        return None
+    coarse = [bit for bit in range(len(stripes.frames)) if 2 * stripes.stripe_px * 2**bit >= phase.periods_px[0]]
+    references = collected.white is not None and collected.black is not None
+    if len(coarse) < LEAST_BITS or (stripes.inverses is None and not references):
+        return None
+    second, deviation = np.zeros_like(axis.coordinate), np.zeros_like(axis.coordinate)
+    for band in planes.bands(BYTES_PER_PIXEL):
+        values = planes.band(band)
+        grey = np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
+        second[band], deviation[band] = (each.reshape(-1, second.shape[1]) for each in _second_bit(grey, stripes, coarse, collected, noise))
+    if not axis.solved.any():
+        return None
+    usual = float(np.median(second[axis.solved]))
+    clear = axis.solved & (usual - second > CLEAR_SIGMAS * deviation)
+    return np.where(clear, np.clip((usual - second) / (2 * max(usual, 1e-6)), 0, 0.5), 0).astype(np.float32)
+
+
+def _second_bit(grey: np.ndarray, stripes: BinaryCode, coarse: Sequence[int], collected: Collected,
+                noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return the second-smallest difference of coarse bits over the contrast, and its standard deviation, [pixels], of readings
+    [frames, pixels]."""
+    bits = grey[[stripes.frames[bit] for bit in coarse]]
+    if stripes.inverses is not None:
+        away = np.abs(bits - grey[[stripes.inverses[bit] for bit in coarse]])
+        contrast, times = away.max(axis=0), 2.0
+    else:
+        assert collected.white is not None and collected.black is not None
+        away = np.abs(2 * bits - grey[collected.white] - grey[collected.black])
+        contrast, times = grey[collected.white] - grey[collected.black], 6.0
+    contrast = np.maximum(contrast, 1e-9)
+    deviation = np.sqrt(times * (noise.read**2 + noise.gain * np.maximum(bits.max(axis=0), 0))) / contrast
+    return np.partition(away, 1, axis=0)[1] / contrast, deviation
