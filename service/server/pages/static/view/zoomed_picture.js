@@ -5,6 +5,7 @@ import { listen } from "../publish/gestures.js";
 import { showScale } from "../publish/overlay.js";
 
 const ZOOM = 1.5;
+const FINER = 2; // pixels of the canvas in a row for each of a picture that is reduced while it moves: the browser enlarges them faster
 const LABEL = "The object under the chosen light. Drag or use the arrow keys to move the light, with Shift to move the picture; plus and minus zoom, 0 shows all.";
 
 /**
@@ -31,7 +32,8 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
     around = colour;
     const { clientWidth: width, clientHeight: height } = canvas;
     if (width === 0 || height === 0) return;
-    const ratio = globalThis.devicePixelRatio ?? 1;
+    let ratio = globalThis.devicePixelRatio ?? 1;
+    if (source.width < state.width) ratio = Math.min(ratio, (FINER * source.width) / (state.width * state.scale(width, height)));
     const size = [Math.round(width * ratio), Math.round(height * ratio)];
     if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
     const scale = state.scale(width, height) * ratio;

@@ -267,7 +267,8 @@ def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor
 def test_a_job_without_an_asset_that_can_be_shown_is_said_and_without_webgl_the_file_is_offered(page, exported):
     page.goto(f"/asset/{exported['usda']}")
     page.get_by_text("this job has no asset.usdz or asset.glb").wait_for()
-    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.add_init_script("""const { getContext } = HTMLCanvasElement.prototype;
+      HTMLCanvasElement.prototype.getContext = function (kind) { return kind === "2d" ? getContext.call(this, kind) : null; }""")
     page.goto(f"/asset/{exported['glb']}")
     page.get_by_text("This browser has no WebGL2").wait_for()
     expect(page.get_by_role("link", name="Its job")).to_have_attribute("href", f"/jobs/{exported['glb']}")

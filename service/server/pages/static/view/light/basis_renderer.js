@@ -217,13 +217,13 @@ export class BasisRenderer {
     return true;
   }
 
-  /** Return the bytes [height, width, 4] of what was drawn, from the top. */
-  pixels() {
+  /** Return the bytes [height, width, 4] of what was drawn of one of so many pixels in a row, from the top. */
+  pixels(stride = 1) {
     const gl = this.#gl;
-    const { width, height } = this.canvas;
+    const [width, height] = this.sizeOf(stride);
     const upward = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, upward);
-    const found = new Uint8Array(upward.length);
+    const found = new Uint8ClampedArray(upward.length);
     for (let row = 0; row < height; row += 1) found.set(upward.subarray(4 * width * row, 4 * width * (row + 1)), 4 * width * (height - 1 - row));
     return found;
   }

@@ -4,12 +4,11 @@
  * drawn in bands, so that a new motion waits for one band at most.
  */
 
-const MOTION_MS = 20; // that a picture may take while something moves: two frames of a screen, with what the next try may take longer
+import { DrawSpeed } from "./draw_speed.js";
+
+const MOTION_MS = 22; // that a picture may take while something moves: thirty a second, with the rest of the page
 const BAND_MS = 25; // that a band of a whole picture may take
 const STILL_MS = 150; // without a change, after which the whole picture is drawn
-const FIRST_PIXELS_PER_MS = 2000; // of a slow program on one core; the first drawings tell better
-const LEARNED = 0.3; // weight of a drawing that took too long in what is known of the speed
-const GROWTH = 1.25; // of the speed that is tried after a drawing in time
 const LOOK_MS = 4; // between two looks whether a drawing is done
 const LARGEST_STRIDE = 16;
 
@@ -23,7 +22,7 @@ export class DrawLoop {
   #pending = null; // the drawing under way
   #asked = false;
   #waiting = []; // who wait for the whole picture
-  #pixelsPerMs = FIRST_PIXELS_PER_MS;
+  #speed = new DrawSpeed();
 
   /**
    * @param {import("./basis_renderer.js").BasisRenderer} renderer
@@ -78,14 +77,14 @@ export class DrawLoop {
     const { rows, cols } = this.#renderer.relight;
     if (this.#pending !== null && !this.#isOver()) return void this.#next();
     if (this.#isMoved) {
-      const stride = Math.min(LARGEST_STRIDE, Math.max(1, Math.ceil(Math.sqrt((rows * cols) / (this.#pixelsPerMs * MOTION_MS)))));
+      const stride = Math.min(LARGEST_STRIDE, Math.max(1, Math.ceil(Math.sqrt((rows * cols) / this.#speed.pixelsIn(MOTION_MS)))));
       this.#isMoved = false;
       this.#row = stride === 1 ? rows : 0;
       this.#begin({ stride }, (rows * cols) / stride ** 2, () => { this.#end(stride); this.#next(); });
     } else if (this.#row < rows) {
       if (performance.now() - this.#changedAt < STILL_MS) return void this.#next();
       const from = this.#row;
-      this.#row = Math.min(rows, from + Math.max(1, Math.floor((this.#pixelsPerMs * BAND_MS) / cols)));
+      this.#row = Math.min(rows, from + Math.max(1, Math.floor(this.#speed.pixelsIn(BAND_MS) / cols)));
       this.#begin({ band: [from, this.#row], isSame: from > 0 }, (this.#row - from) * cols, () => (this.#row === rows ? this.#end(1) : this.#next()));
     }
     return undefined;
@@ -102,9 +101,7 @@ export class DrawLoop {
   #isOver() {
     const { fence, began, pixels, done } = this.#pending;
     if (!this.#renderer.isPast(fence)) return false;
-    const taken = Math.max(1, performance.now() - began);
-    if (taken > MOTION_MS) this.#pixelsPerMs += LEARNED * (Math.min(this.#pixelsPerMs, pixels / taken) - this.#pixelsPerMs);
-    else this.#pixelsPerMs = Math.max(this.#pixelsPerMs, Math.min(GROWTH * this.#pixelsPerMs, (GROWTH * pixels) / taken)); // looks are too rare to tell more
+    this.#speed.add(pixels, Math.max(1, performance.now() - began));
     this.#pending = null;
     done();
     return true;

@@ -154,7 +154,9 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   function show(stride) {
     const [width, height] = renderer.sizeOf(stride);
     if (front.width !== width || front.height !== height) [front.width, front.height] = [width, height];
-    front.getContext("2d").drawImage(drawn, 0, drawn.height - height, width, height, 0, 0, width, height);
+    const context = front.getContext("2d");
+    if (stride === 1) context.drawImage(drawn, 0, 0);
+    else context.putImageData(new ImageData(renderer.pixels(stride), width), 0, 0); // the canvas as an image would be as large as the whole picture
     Object.assign(canvas.dataset, { stride, shown: "live" });
     zoomed.draw(AROUND);
     const { framesPerSecond, gpuMs } = renderer.timer.figures();
