@@ -33,6 +33,9 @@ PLACES, AT_A_PLACE, OF_STEPS = 3, 8, 0.01
 steps, from which on that order is named. An edge of depth jumps between other stripes in every row."""
 MENDED = 5.0
 """Jumps that another order mends over those that it makes."""
+DENSE = 0.8
+"""Part of the neighbours with other bits that differ in one alone, from which on they lie in stripes side by side: stripes three apart may
+differ in one bit too."""
 CONTRADICTED, FOLLOWED = 0.25, 0.4
 """Part of the neighbours that differ in one bit of a Gray code alone whose stripes follow each other: below the first for a bit, the order
 of bits is wrong, and above the second for every bit, it is right. In scenes full of edges it is 0.73 at least for the right order."""
@@ -181,10 +184,16 @@ def _exchange_words(swap: tuple[int, int], stripes: Stripes) -> str:
 
 
 def _exchanged(bits: np.ndarray, pairs: _Pairs) -> tuple[int, int] | None:
-    """Return two bits of a Gray code that are exchanged, None if none are: stripes side by side differ in one bit, and few others do."""
+    """Return two bits of a Gray code that are exchanged, None if none are: stripes side by side differ in one bit, and few others do,
+    unless neighbouring pixels lie several stripes apart. Then the finest bits are left out."""
     flat = bits.reshape(len(bits), -1)
     changes = flat[:, pairs.first] != flat[:, pairs.second]
-    alone = changes.sum(axis=0) == 1
+    counts = np.cumsum(changes[::-1], axis=0)[::-1]  # of changes in each bit and all coarser ones
+    dense = [bit for bit, count in enumerate(counts[:-2]) if (count == 1).sum() >= DENSE * (count > 0).sum()]
+    if not dense:
+        return None
+    finest = dense[0]
+    flat, changes, alone = flat[finest:], changes[finest:], counts[finest] == 1
     ends = flat[:, np.stack([pairs.first, pairs.second])[:, alone]]  # [bits, 2, pairs]
     edges = [edge for edge in changes[:, alone] if len(np.unique(pairs.row[alone][edge])) >= LEAST_ROWS]
 
@@ -195,8 +204,8 @@ def _exchanged(bits: np.ndarray, pairs: _Pairs) -> tuple[int, int] | None:
 
     if following(ends) >= CONTRADICTED:
         return None
-    likely, swap = max((following(_with_exchanged(ends, swap)), swap) for swap in combinations(range(len(bits)), 2))
-    return swap if likely >= FOLLOWED else None
+    likely, swap = max((following(_with_exchanged(ends, swap)), swap) for swap in combinations(range(len(flat)), 2))
+    return (swap[0] + finest, swap[1] + finest) if likely >= FOLLOWED else None
 
 
 def _mends(numbers: np.ndarray, pairs: _Pairs, declared: np.ndarray, jumps: np.ndarray, count: float, *, outside: bool) -> float | None:

@@ -1,6 +1,7 @@
 """Codes that are declared otherwise than they were shown are named, and right ones raise no doubt: a sphere before a plane, with shadow."""
 
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,6 +68,16 @@ def test_a_wrong_declaration_is_named(scene, patterns, declared, words):
 def test_any_two_bits_that_are_exchanged_are_named(scene, swap):
     declared = changed(GRAY, "gray", bit=lambda p: dict([swap, swap[::-1]]).get(p["bit"], p["bit"]))
     assert f"the bits {swap[0]} and {swap[1]} are exchanged" in said(scene, GRAY, declared)
+
+
+@pytest.mark.parametrize("step", [2.2, 3.0, 3.4])
+def test_stripes_that_neighbouring_pixels_skip_raise_no_doubt(step):
+    """Gray numbers three stripes apart may differ in one bit, as those of stripes side by side always do."""
+    row, col = np.indices((64, int(SIZE[0] / step)))
+    uv = np.stack([step * (col + 0.01 * row), row + 0.5], axis=-1)
+    plane = SimpleNamespace(albedo=np.full((*row.shape, 3), 0.7), uv=uv, shaded=np.zeros(row.shape, bool), depth=np.ones(row.shape))
+    fine = [*gray_patterns("column", stripe=1), *BLACK_WHITE]
+    assert said(plane, fine, fine) is None
 
 
 def test_stripes_beyond_the_projector_are_named(scene):

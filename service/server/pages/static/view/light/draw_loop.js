@@ -10,7 +10,7 @@ const MOTION_MS = 22; // that a picture may take while something moves: thirty a
 const BAND_MS = 25; // that a band of a whole picture may take
 const STILL_MS = 150; // without a change, after which the whole picture is drawn
 const LOOK_MS = 4; // between two looks whether a drawing is done
-const LARGEST_STRIDE = 16;
+const LEAST_PIXELS = 30_000; // of a picture while something moves: of fewer too little is seen
 
 export class DrawLoop {
   #renderer;
@@ -77,7 +77,7 @@ export class DrawLoop {
     const { rows, cols } = this.#renderer.relight;
     if (this.#pending !== null && !this.#isOver()) return void this.#next();
     if (this.#isMoved) {
-      const stride = Math.min(LARGEST_STRIDE, Math.max(1, Math.ceil(Math.sqrt((rows * cols) / this.#speed.pixelsIn(MOTION_MS)))));
+      const stride = Math.max(1, Math.ceil(Math.sqrt((rows * cols) / Math.max(this.#speed.pixelsIn(MOTION_MS), LEAST_PIXELS))));
       this.#isMoved = false;
       this.#row = stride === 1 ? rows : 0;
       this.#begin({ stride }, (rows * cols) / stride ** 2, () => { this.#end(stride); this.#next(); });
