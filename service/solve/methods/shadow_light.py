@@ -55,10 +55,10 @@ SHOWN = 2.0
 """Bounced light over the noise floor at which a reading counts as showing it."""
 DECIDED = 0.4
 """Largest relative standard error at which the images decide the scale."""
-LEAST_SHOWN = 0.25
+LEAST_SHOWN = 0.06
 """Median of the light in shadows over that which the form factors expect, below which no light has bounced: images that were rendered or
-separated so. Form factors of a surface that was found from bounced light are at most a third off. Where albedo is found above 1, the light
-that is expected is as much too large, and the limit is lower."""
+separated so have up to .011, real ones .24 and more, where dark readings are crushed, or albedo is found five times too large. Where it is
+found above 1, the light that is expected is as much too large, and the limit is lower."""
 LEAST_ALBEDO = 0.02
 """Pixels of less albedo say nothing of its scale: what they send on is mostly stray or specular."""
 GROUPS = 12
@@ -149,14 +149,16 @@ def fit_albedo_scale(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray
 
 
 def shown_bounce(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray, group: np.ndarray) -> float | None:
-    """Return the median of readings in shadow over the light that is expected there from other surfaces, with the arguments of
-    `fit_albedo_scale`, or None where too few readings tell: 1 where light bounces as expected, 0 in images without bounced light."""
+    """Return the median of readings in shadow over the light that is expected there from other surfaces, of the half of them where most is
+    expected, with the arguments of `fit_albedo_scale`; or None where too few readings tell. It is 1 where light bounces as expected, and 0
+    in images without bounced light."""
     behind = cosine < -LEAST_COSINE_BEHIND
     cast = (cosine > LEAST_COSINE_CAST) & (ratio < DARK * DIRECT * cosine)
     used = np.isfinite(ratio) & np.isfinite(arriving) & (behind | cast) & (arriving > SHOWN * NOISE_FLOOR)
     groups, lights = np.broadcast_arrays(group[:, None], np.arange(ratio.shape[1]))
     if used.sum() < LEAST_READINGS or min(len(np.unique(each[used])) for each in (groups, lights)) < LEAST_GROUPS:
         return None
+    used &= arriving >= np.median(arriving[used])  # a wrong black level matters least there
     return float(np.median(ratio[used] / arriving[used]))
 
 
