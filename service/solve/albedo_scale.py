@@ -2,7 +2,7 @@
 
 The albedo of such a capture is known up to that factor. Under the lights of the manifest it may lie above 1, which no texture holds, or,
 where a rig has large units, below what half floats hold. In the maps it has the scale that the light between its surfaces tells, where that
-is decided (service.solve.methods.settling); else its bright pixels have the albedo of a usual bright surface.
+is decided (service.solve.methods.shadow_light); else its bright pixels have the albedo of a usual bright surface.
 """
 
 import numpy as np
