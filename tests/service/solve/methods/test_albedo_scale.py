@@ -69,7 +69,7 @@ def test_one_light_or_one_place_decides_nothing():
 
 @pytest.mark.parametrize(("albedo", "scale"), [(0.3, 0.5), (0.6, 2.0), (0.9, 5.0)])
 def test_bounced_light_is_shown_by_shadows(albedo, scale):
-    """Of so much light as the form factors say `scale` times is there, 1 % of noise beside it; of none, noise of both signs."""
+    """Shadows hold `scale` times the light that the form factors expect, with noise of 1 %; or no light, and noise of both signs."""
     ratio, arriving, cosine, group = shadows(Groove(16), albedo=albedo, scale=scale, noise=0.003)
     assert shown_bounce(ratio, arriving, cosine, group) == pytest.approx(scale, rel=0.1)
     dark = np.where(cosine < 0, 0.003 * np.random.default_rng(4).normal(size=ratio.shape), 1.0)
