@@ -16,7 +16,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
-from stage.colour.colour import GREY_WEIGHTS
+from service.depth.patterns.pattern_checks import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Code, Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -145,8 +145,7 @@ def _measure_of(used: Sequence[Code], collected: Collected, noise: NoiseModel) -
 
 
 def _lags(planes: Planes, axis: AxisMaps, rows: slice, measure: _Measure) -> Lags:
-    values = planes.band(rows)
-    grey = np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
+    grey = grey_of(planes.band(rows))
     solved = axis.solved[rows]
     if planes.saturated is not None:
         solved = solved & ~planes.saturated[:, rows].any(axis=0)

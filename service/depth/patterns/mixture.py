@@ -12,7 +12,7 @@ import numpy as np
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
-from stage.colour.colour import GREY_WEIGHTS
+from service.depth.patterns.pattern_checks import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.phase import PhaseCode
@@ -54,15 +54,12 @@ def _mixed_part(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
         return None
     coarse = [bit for bit in range(len(stripes.frames)) if 2 * stripes.stripe_px * 2**bit >= phase.periods_px[0]]
     references = collected.white is not None and collected.black is not None
-    if len(coarse) < LEAST_BITS or (stripes.inverses is None and not references):
+    if len(coarse) < LEAST_BITS or (stripes.inverses is None and not references) or not axis.solved.any():
         return None
     second, deviation = np.zeros_like(axis.coordinate), np.zeros_like(axis.coordinate)
     for band in planes.bands(BYTES_PER_PIXEL):
-        values = planes.band(band)
-        grey = np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
+        grey = grey_of(planes.band(band))
         second[band], deviation[band] = (each.reshape(-1, second.shape[1]) for each in _second_bit(grey, stripes, coarse, collected, noise))
-    if not axis.solved.any():
-        return None
     usual = float(np.median(second[axis.solved]))
     clear = axis.solved & (usual - second > CLEAR_SIGMAS * deviation)
     return np.where(clear, np.clip((usual - second) / (2 * max(usual, 1e-6)), 0, 0.5), 0).astype(np.float32)

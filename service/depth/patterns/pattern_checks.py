@@ -52,6 +52,11 @@ LEAST_SIGNAL = 20.0
 """Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
 
 
+def grey_of(values: np.ndarray) -> np.ndarray:
+    """Return [frames, pixels] of readings [frames, channels, pixels] float32."""
+    return np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
+
+
 class Sample(NamedTuple):
     """Some rows of the frames."""
 
@@ -64,9 +69,7 @@ class Sample(NamedTuple):
     @property
     def grey(self) -> np.ndarray:
         """Return [frames, pixels] float32."""
-        if self.values.shape[1] == 1:
-            return self.values[:, 0]
-        return np.tensordot(self.values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+        return grey_of(self.values)
 
     @property
     def whole(self) -> np.ndarray:

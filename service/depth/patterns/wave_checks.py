@@ -89,11 +89,8 @@ def check_waves(sample: Sample, collected: Collected, projector: PatternProjecto
                 noise: NoiseModel) -> WaveFindings:
     """Return what the waves of each axis without stripes say of their declaration; `model` is None without calibration."""
     said = None
-    numbered = {code.axis for code in collected.codes if isinstance(code, BinaryCode | KaryCode)}
     alone = len({code.axis for code in collected.codes}) == 1
-    for code in collected.codes:
-        if not isinstance(code, PhaseCode) or code.micro or code.axis in numbered:
-            continue
+    for code in unnumbered(collected):
         waves = waves_of(sample, code, projector, noise)
         if waves is None:
             continue
@@ -108,6 +105,13 @@ def check_waves(sample: Sample, collected: Collected, projector: PatternProjecto
         if unconfirmed is not None and said is None:
             said = f"frames[].pattern: the {code.axis} phases {unconfirmed}"
     return WaveFindings(None, said)
+
+
+def unnumbered(collected: Collected, *, least_periods: int = 1) -> list[PhaseCode]:
+    """Return the waves, of so many periods at least, that no stripes of their axis number."""
+    numbered = {code.axis for code in collected.codes if isinstance(code, BinaryCode | KaryCode)}
+    return [code for code in collected.codes if isinstance(code, PhaseCode) and not code.micro and code.axis not in numbered
+            and len(set(code.periods_px)) >= least_periods]
 
 
 def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise: NoiseModel) -> Waves | None:
@@ -313,10 +317,7 @@ def _impossible(turns: np.ndarray, clear: np.ndarray, waves: Waves, sample: Samp
 def bent_back(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> PatternProjector | None:
     """Return the projector with the exponent of light = level^γ under which several periods agree, and the error that it leaves; None if
     they agree without one, or under none."""
-    numbered = {code.axis for code in collected.codes if isinstance(code, BinaryCode | KaryCode)}
-    for code in collected.codes:
-        if not isinstance(code, PhaseCode) or code.micro or code.axis in numbered or len(set(code.periods_px)) < 2:
-            continue
+    for code in unnumbered(collected, least_periods=2):
         plain = _fit(sample, code, projector, 1.0, noise)
         if plain is None or plain[0] < max(MISFIT, NOISE_TIMES * plain[1]):
             continue

@@ -10,11 +10,8 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.unwrap import unwrap_range
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import Sample
-from service.depth.patterns.wave_checks import CROSSING_SHARE, CROSSINGS, MISFIT, NOISE_TIMES, Waves, joint_fit, waves_of
-from stage.patterns.binary import BinaryCode
+from service.depth.patterns.wave_checks import CROSSING_SHARE, CROSSINGS, MISFIT, NOISE_TIMES, Waves, joint_fit, unnumbered, waves_of
 from stage.patterns.codes import Collected
-from stage.patterns.kary import KaryCode
-from stage.patterns.phase import PhaseCode
 
 LOOKED_AT = 2.0
 """How far places are looked for, as a multiple of the projector, where the periods tell them apart so far."""
@@ -30,13 +27,9 @@ BESIDE_PERIODS = 0.5
 
 def check_range(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
     """Return a sentence if surfaces go on beyond the border of the projector, which has the exponent of its waves where they are bent."""
-    numbered = {code.axis for code in collected.codes if isinstance(code, BinaryCode | KaryCode)}
-    for code in collected.codes:
-        if not isinstance(code, PhaseCode) or code.micro or code.axis in numbered or len(set(code.periods_px)) < 2:
-            continue
+    for code in unnumbered(collected, least_periods=2):
         waves = waves_of(sample, code, projector, noise)
-        farthest = None if waves is None else _farthest(waves)
-        if farthest is not None and waves is not None:
+        if waves is not None and (farthest := _farthest(waves)) is not None:
             return (f"frames: the {code.axis} phases go on beyond the {waves.extent} {code.axis}s of the projector, to about "
                     f"{farthest:.0f}: check projector.resolution, and period_px in the frames' patterns")
     return None
