@@ -2,7 +2,8 @@
 
 The reference period gives offset A, amplitude B and a phase. All other frames share A and B: the periods are so short that interreflection
 averages every pattern out, and so similar that defocus dims all of them alike. Every wrap of the reference predicts their readings, and the
-one whose misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance.
+one whose misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance. Where χ² stays larger
+than noise makes it, as where a pixel sees two surfaces, the deviation grows with its root (Birge 1932).
 
 Source: Gupta and Nayar, "Micro Phase Shifting", CVPR 2012, equations 5 to 10.
 """
@@ -33,6 +34,8 @@ MIN_SEPARATION = 0.05
 places apart."""
 BORDER_PX = 0.5
 """Distance in projector pixels by which a decoded place may lie outside the projector."""
+SELDOM = 1.3
+"""Standard deviations of the sum of squares above its mean that a tenth of all pixels exceed by noise."""
 STEPS = 3
 """Number of Gauss-Newton steps: the start has the noise of three readings, and each step squares the error."""
 
@@ -80,6 +83,8 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     turns = 2 * np.pi * np.outer(wraps, ratio)
     order = np.concatenate([others, np.flatnonzero(member)])
     table = np.stack([1 / periods[order], np.array(shifts)[order]], axis=1)
+    free = len(order) - 3
+    usual = free + SELDOM * np.sqrt(2 * free)
     result = unwritten_decoded(frames.pixel_count, frames.device)
     scratch = wp.empty((2 * len(others), frames.packs * pack), dtype=wp.float32, device=device)
     inputs = [as_packs(array, device) for array in (start.phase, start.amplitude, start.offset, start.status)]
@@ -88,7 +93,7 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
                     wp.array(np.array(numbers)[order], dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec2, device=device),
                     wp.array(light_table(response), dtype=wp.float32, device=device),
                     wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1), dtype=wp.vec2, device=device),
-                    float(reference), float(member.sum()), float(extent), wave_error_px**2, noise.read**2, noise.gain],
+                    float(reference), float(member.sum()), float(extent), usual, wave_error_px**2, noise.read**2, noise.gain],
                    [as_packs(array, device) for array in (scratch, *result)], device=device)
     return result
 
@@ -152,6 +157,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                      period: float,
                      shifts: float,  # frames of the reference
                      extent: float,
+                     usual: float,  # sum of squares, in its variance, that noise seldom exceeds
                      wave_variance: float,
                      read_variance: float,
                      gain: float,
@@ -206,7 +212,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                 keep_better(cost, u, best[k], second[k], place[k])
 
         # A, B and u from all frames, each by its variance
-        information = float_pack()
+        information, unexplained = float_pack(), float_pack()
         for _step in range(STEPS):
             aa, ab, au, bb, bu, uu = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
             ra, rb, ru, squares_left = float_pack(), float_pack(), float_pack(), float_pack()
@@ -235,6 +241,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                 swing[k] = swing[k] + db
                 mean[k] = mean[k] + (ra[k] - ab[k] * db - au[k] * du) / aa[k]
                 information[k] = left
+                unexplained[k] = squares_left[k]
         u_out, error, height, result = float_pack(), float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             code = int(given[k])
@@ -246,7 +253,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                     code = _MULTIPATH
             if keeps_place(code) and information[k] > 0.0 and place[k] >= -BORDER_PX and place[k] <= extent + BORDER_PX:
                 u_out[k] = place[k]
-                error[k] = wp.sqrt(1.0 / information[k] + wave_variance)
+                error[k] = wp.sqrt(wp.max(unexplained[k] / usual, 1.0) / information[k] + wave_variance)
                 height[k] = swing[k]
             result[k] = wp.uint8(code)
         coordinate[p] = u_out

@@ -36,6 +36,9 @@ taken for translucent. Noise alone goes beyond it at one place in 370, which mak
 CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""
+WIDESPREAD_SIGMAS, WIDESPREAD = 2.0, 0.4
+"""Lag in its standard deviations, and part of all pixels that have one beyond, from which on light runs below surfaces whatever the
+directions: noise makes one at a twentieth, and texture under a lens out of focus at a tenth."""
 EDGE_TIMES, DIMMED_TIMES = 2.0, 0.7
 """What the lag of stripes, and the width of light that dims a wave as much as it is dimmed, count as a standard deviation of the place:
 between what is right for light that runs near and far."""
@@ -45,6 +48,12 @@ periods are counted wrongly."""
 NEAR_PART, FAR_PART = 0.25, 0.5
 """Distances of pixels from the edge of a stripe, as parts of the finest stripe, that tell where the edge crosses the mean of white and
 black, and where half of the light has come."""
+EVEN = 0.5
+"""Least spread of pixels about an edge, as a part of that of pixels all along: those of one side alone do not tell where it is."""
+MIDDLE = 0.4
+"""Middle of a stripe, as a part of it, where its edges are far."""
+UNKNOWN = np.nan, 0.0, 0.0, np.nan
+"""Fields of `Lags` where too little is decoded."""
 LAG_BYTES_PER_PIXEL = 2000
 """Memory that the fit of waves takes for each pixel."""
 
@@ -60,7 +69,7 @@ class LagFinding(NamedTuple):
 
     def sentence(self, axis: str) -> str:
         """Return what a user is told."""
-        return (f"frames[].pattern: {axis}s that different {axis} patterns show differ by {self.usual_px:.2g} px to one side at "
+        return (f"frames[].pattern: {axis}s that different {axis} patterns show differ by {self.usual_px:.2g} px at "
                 f"{100 * self.share:.0f} % of the pixels, as where light runs below the surface of translucent things, or where frames "
                 "hold part of the next pattern: the standard deviations hold about what that makes; cover such things with matt paint or "
                 "powder")
@@ -72,15 +81,24 @@ class Lags(NamedTuple):
     size: np.ndarray  # [rows, cols] projector pixels, NaN where too little is decoded
     deviation: np.ndarray  # [rows, cols] of noise
     error: np.ndarray  # [rows, cols] by how much the place is off if light from below the surface makes the lag
+    most: np.ndarray  # [rows, cols] lag that the dimming of fine waves against wider ones allows; NaN where nothing tells it
+
+    def beyond(self, sigmas: float) -> np.ndarray:
+        """Return where the lag is larger than so many standard deviations, and not larger than light from nearby makes, [rows, cols] bool:
+        what bounces off another surface shifts the edges of stripes, and dims wide and fine ones alike."""
+        return (np.abs(self.size) > sigmas * self.deviation) & ~(np.abs(self.size) > self.most)
 
     def clear(self) -> tuple[float, float] | None:
         """Return the usual size of the lags that are clear, and their part of the decoded pixels; None where they show no light below
         surfaces."""
-        size, deviation = (values[np.isfinite(self.size)] for values in (self.size, self.deviation))
-        found = size[np.abs(size) > np.maximum(CLEAR_SIGMAS * deviation, CLEAR_PX)]
-        if not found.size or found.size < CLEAR_SHARE * size.size or abs(np.sign(found).mean()) < 2 * ONE_WAY - 1:
-            return None
-        return float(np.median(np.abs(found))), found.size / size.size
+        known = np.isfinite(self.size)
+        found = self.size[self.beyond(CLEAR_SIGMAS) & (np.abs(self.size) > CLEAR_PX)]
+        one_way = bool(found.size) and abs(np.sign(found).mean()) >= 2 * ONE_WAY - 1
+        if found.size < CLEAR_SHARE * known.sum() or not one_way:
+            found = self.size[self.beyond(WIDESPREAD_SIGMAS)]
+            if not found.size or found.size < WIDESPREAD * known.sum() or np.median(np.abs(found)) < CLEAR_PX / 2:
+                return None
+        return float(np.median(np.abs(found))), found.size / known.sum()
 
 
 def widen_lagging(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
@@ -109,7 +127,7 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
     strips = [_lags(planes, axis, slice(top, min(top + AROUND, height)), measure) for top in tops]
     if Lags(*(np.concatenate(values) for values in zip(*strips, strict=True))).clear() is None:
         return None
-    lags = Lags(np.full_like(axis.coordinate, np.nan), np.zeros_like(axis.coordinate), np.zeros_like(axis.coordinate))
+    lags = Lags(*(np.full_like(axis.coordinate, value) for value in UNKNOWN))
     for band in planes.bands(LAG_BYTES_PER_PIXEL):
         around = slice(max(band.start - AROUND, 0), min(band.stop + AROUND, height))
         inside = slice(band.start - around.start, band.stop - around.start)
@@ -118,7 +136,7 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
     clear = lags.clear()
     if clear is None:
         return None
-    beside = maximum_filter(np.abs(lags.size) > PROBABLE_SIGMAS * lags.deviation, 2 * AROUND + 1)
+    beside = maximum_filter(lags.beyond(PROBABLE_SIGMAS), 2 * AROUND + 1)
     return LagFinding(np.where(beside, lags.error, 0), *clear)
 
 
@@ -151,7 +169,7 @@ def _lags(planes: Planes, axis: AxisMaps, rows: slice, measure: _Measure) -> Lag
         solved = solved & ~planes.saturated[:, rows].any(axis=0)
     at = np.flatnonzero(solved)
     if not at.size:
-        return Lags(np.full(solved.shape, np.nan), np.zeros(solved.shape), np.zeros(solved.shape))
+        return Lags(*(np.full(solved.shape, value) for value in UNKNOWN))
     told = measure.sums(grey[:, at].astype(np.float64), axis.coordinate[rows].ravel()[at].astype(np.float64))
     sums = np.zeros((len(told), solved.size))
     sums[:, at] = told
@@ -159,7 +177,7 @@ def _lags(planes: Planes, axis: AxisMaps, rows: slice, measure: _Measure) -> Lag
     means = np.stack([uniform_filter(each.reshape(solved.shape), AROUND, mode="constant") for each in sums]) / part
     found = measure.lag(means, part * AROUND**2)
     known = solved & (part >= LEAST_KNOWN)
-    return Lags(*(np.where(known, values, empty) for values, empty in zip(found, (np.nan, 0, 0), strict=True)))
+    return Lags(*(np.where(known, values, empty) for values, empty in zip(found, UNKNOWN, strict=True)))
 
 
 def _wave_sums(grey: np.ndarray, place: np.ndarray, phase: PhaseCode, noise: NoiseModel) -> np.ndarray:
@@ -190,11 +208,15 @@ def _wave_lag(means: np.ndarray, count: np.ndarray, phase: PhaseCode) -> Lags:
     size, deviation = means[0] / weight, np.sqrt(np.maximum(means[2], 0) / np.maximum(count, 1)) / weight
     dimmed = np.maximum(-means[3] / np.maximum(means[4], 1e-30), 0)  # change of the amplitude's logarithm with that of the frequency
     usual = float(np.exp(np.log(phase.periods_px).mean())) / (2 * np.pi)
-    return Lags(size, deviation, np.hypot(size, np.pi / 2 * dimmed * usual))
+    most = np.pi / 2 * dimmed * usual
+    return Lags(size, deviation, np.hypot(size, most), most)
 
 
 def _edge_sums(grey: np.ndarray, place: np.ndarray, code: BinaryCode, phase: PhaseCode, collected: Collected) -> np.ndarray:
-    """Return sums that tell where the edges of stripes lie, against the places of waves, and how much the waves are dimmed."""
+    """Return sums that tell where the edges of stripes lie, against the places of waves, and how much the waves are dimmed.
+
+    Of edges those of stripes as wide as a period count: finer ones shift as the wave does.
+    """
     frames = grey[list(code.frames)]
     if code.inverses is not None:
         contrast = frames - grey[list(code.inverses)]
@@ -204,24 +226,28 @@ def _edge_sums(grey: np.ndarray, place: np.ndarray, code: BinaryCode, phase: Pha
     away = place - edge * code.stripe_px
     before, after = ((number if code.name == "binary" else number ^ (number >> 1)) for number in (edge - 1, edge))
     changed = before ^ after
-    bit = np.minimum(np.rint(np.log2(changed & -changed)).astype(np.int64), len(contrast) - 1)  # the finest that changes
+    bit = np.minimum(np.log2(changed).astype(np.int64), len(contrast) - 1)  # the coarsest that changes
     white = np.maximum(np.abs(contrast).max(axis=0), 1e-12)
     step = np.where(after >> bit & 1, 1, -1) * np.take_along_axis(contrast, bit[None], 0)[0] / white
     _, along, across = weights(np.array(phase.shifts), phase.periods_px[0]).T @ grey[list(phase.frames)]
-    sums = [2 * np.hypot(along, across), white]
+    wave = 2 * np.hypot(along, across)
+    wide, width = _wider_bit(code, phase)
+    amid = np.abs((place / width + (0.5 if code.name == "binary" else 0) + 0.5) % 1 - 0.5) <= MIDDLE / 2
+    sums = [wave, white, np.where(amid, wave, 0), np.where(amid, np.abs(contrast[wide]), 0)]
     for part, run in ((NEAR_PART, away), (FAR_PART, np.clip(2 * away / (FAR_PART * code.stripe_px), -1, 1))):
-        near = np.abs(away) <= part * code.stripe_px
+        near = (bit >= wide) & (np.abs(away) <= part * code.stripe_px)
         sums += [np.where(near, each, 0) for each in (np.ones_like(away), run, run**2, step, run * step, step**2)]
     return np.stack(sums)
 
 
 def _edge_lag(means: np.ndarray, count: np.ndarray, code: BinaryCode, phase: PhaseCode) -> Lags:
     """Return the lag of the place where white and black are equal, or of that where half of the light has come, whichever is larger."""
-    found = []
-    for ones, *others in (means[2:8], means[8:]):
+    found, known = [], np.ones(means.shape[1:], bool)
+    for (ones, *others), even in ((means[4:10], (NEAR_PART * code.stripe_px) ** 2 / 3), (means[10:], 2 / 3)):
         number = np.maximum(ones, 1e-12)
         run, square, step, product, power = (each / number for each in others)
         spread = np.maximum(square - run**2, 1e-12)
+        known = known & (spread > EVEN * even)
         slope = np.maximum((product - run * step) / spread, 1e-3)
         level = step - slope * run
         rest = np.maximum(power - step**2 - slope**2 * spread, 0)
@@ -234,4 +260,15 @@ def _edge_lag(means: np.ndarray, count: np.ndarray, code: BinaryCode, phase: Pha
     size = -np.where(larger, near, far)
     dimmed = np.clip(means[0] / np.maximum(means[1], 1e-30), 0.01, 1)
     wide = np.sqrt(-2 * np.log(dimmed)) * phase.periods_px[0] / (2 * np.pi)  # standard deviation of a Gaussian that dims as much
-    return Lags(size, np.where(larger, near_error, far_error), np.hypot(EDGE_TIMES * size, DIMMED_TIMES * wide))
+    fine = np.where(means[3] > 0, means[2] / np.maximum(means[3], 1e-30), np.nan)  # against stripes as wide as its period
+    _, width = _wider_bit(code, phase)
+    most = np.maximum(-np.log(np.maximum(fine, 1e-3)), 0) / np.log(2 * width / phase.periods_px[0]) * phase.periods_px[0] / 4
+    return Lags(np.where(known, size, np.nan), np.where(larger, near_error, far_error),
+                np.hypot(EDGE_TIMES * size, DIMMED_TIMES * wide), most)
+
+
+def _wider_bit(code: BinaryCode, phase: PhaseCode) -> tuple[int, float]:
+    """Return the finest bit whose stripes are as wide as a period of the wave, or the widest, and how wide they are, projector pixels."""
+    finest = code.stripe_px * (1 if code.name == "binary" else 2)
+    bit = min(max(int(np.ceil(np.log2(phase.periods_px[0] / finest))), 0), len(code.frames) - 1)
+    return bit, finest * 2**bit

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.projected_scenes import Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
-from stage.patterns.phase import phase_patterns
+from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.results.depth_maps import DepthMaps
 
 RIG = Rig(camera=(150, 80), camera_focal=195.0, projector=(256, 144), projector_focal=330.0)
@@ -17,7 +17,8 @@ WIDTHS = (0.3, 0.6, 0.9, 1.2, 1.5, 1.9)
 WIRES = tuple(Wall((-0.33 + 0.11 * number, 0, NEAR), (0, 0, 1), 0.5, half_m=(width * PIXEL / 2, 0.5))
               for number, width in enumerate(WIDTHS))
 PATTERNS = {"Gray": binary_patterns(RIG.projector[0], "column"), "waves": phase_patterns("column", (16, 18, 21), 4),
-            "wave and Gray": (*phase_patterns("column", (16,), 4), *binary_patterns(RIG.projector[0], "column", stripe_px=8))}
+            "wave and Gray": (*phase_patterns("column", (16,), 4), *binary_patterns(RIG.projector[0], "column", stripe_px=8)),
+            "micro": micro_patterns(RIG.projector[0], "column", periods=6, mean_period_px=24)}
 
 
 @pytest.fixture(scope="module")
@@ -39,4 +40,5 @@ def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(relit, tmp_
     solved = maps.mask & near & np.isfinite(wall)
     assert solved.sum() > 300
     off = np.minimum(np.abs(maps.depth - wall), np.abs(maps.depth + NEAR))[solved] / maps.sigma[solved]
-    assert (off > 5).mean() < 0.03  # 0; a wave and Gray code 0.007, and 0.27 without what its bits tell
+    # 0; a wave and Gray code 0.007, and 0.27 without what its bits tell; micro 0.003, and 0.13 without what its fit leaves unexplained
+    assert (off > 5).mean() < 0.03
