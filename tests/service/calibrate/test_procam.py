@@ -42,6 +42,7 @@ def write_view(folder, pose, radiance=None, **manifest):
     normal = pose[:3, 2]
     points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
     uv = reference.seen_by(PROJECTOR, boards.POSE, points)
+    reached = ((uv >= 0) & (uv < (PROJECTOR.width, PROJECTOR.height))).all(axis=-1)
     frames = []
     for number, pattern in enumerate(PATTERNS):
         if pattern["code"] == "phase":
@@ -49,6 +50,7 @@ def write_view(folder, pose, radiance=None, **manifest):
             light = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
         else:
             light = np.full(radiance.shape, float(pattern["code"] == "white"))
+        light = np.where(reached, light, 0)
         write_image(folder / f"{number}.png", np.rint(65535 * radiance * (0.02 + 0.9 * light)).astype(np.uint16))
         frames.append({"image": f"{number}.png", "pattern": pattern})
     write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames, **manifest,
