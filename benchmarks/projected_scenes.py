@@ -232,13 +232,14 @@ def _add_fog(world: World, parts: list[tuple[np.ndarray, ...]], pixel: np.ndarra
         parts.append((pixel[kept], u[kept], v[kept], value[kept]))
 
 
-def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarray:
-    """Return the recorded images, [frames, rows, cols] 0…1."""
+def images(world: World, light: Light | Sequence[Light], patterns: Sequence[Pattern]) -> np.ndarray:
+    """Return the recorded images, [frames, rows, cols] 0…1; `light`: that of all frames, or one for each."""
     width, height = world.rig.camera
     rng = np.random.default_rng(world.seed)
     frames = np.empty((len(patterns), height, width))
-    column, row = (np.floor(place * FINE).astype(int) for place in (light.u, light.v))
     for number, pattern in enumerate(patterns):
+        seen = light if isinstance(light, Light) else light[number]
+        column, row = (np.floor(place * FINE).astype(int) for place in (seen.u, seen.v))
         following = patterns[(number + 1) % len(patterns)]
         light_of, then = (draw(each, world.rig.projector).astype(np.float64) ** world.gamma for each in (pattern, following))
         shown = _focus((1 - world.mixed) * light_of + world.mixed * then, world.blur_px)
@@ -247,8 +248,8 @@ def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarra
             kernel = away ** (world.flights - 1) * np.exp(-away * world.flights)
             below = convolve1d(shown, kernel / kernel.sum(), axis=1, mode="nearest", origin=-(len(kernel) // 2))
             shown = (1 - world.scattered) * shown + world.scattered * below
-        recorded = np.bincount(light.pixel, light.weight * shown[row, column], width * height) * world.light
-        recorded += light.ambient * world.ambient
+        recorded = np.bincount(seen.pixel, seen.weight * shown[row, column], width * height) * world.light
+        recorded += seen.ambient * world.ambient
         recorded = rng.poisson(recorded * world.electrons) / world.electrons + rng.normal(0, world.read_noise, recorded.shape)
         frames[number] = np.clip(recorded, 0, 1).reshape(height, width)
     top = 2**world.bits - 1
@@ -271,7 +272,7 @@ def _focus(shown: np.ndarray, blur_px: float) -> np.ndarray:
 
 
 def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, light: Light | None = None,
-                  declared: Sequence[Pattern] | None = None, **projector: Any) -> Light:
+                  declared: Sequence[Pattern] | None = None, moments: Sequence[Light] | None = None, **projector: Any) -> Light:
     """Write a capture of these patterns.
 
     Args:
@@ -280,6 +281,7 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
         patterns: what is projected, frame by frame.
         light: of `trace`, where the same world is captured again.
         declared: what the manifest says instead; None: the truth.
+        moments: light of each frame, where something moves.
         projector: further fields of the manifest's projector.
 
     Returns:
@@ -288,7 +290,7 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
     light = trace(world) if light is None else light
     folder.mkdir(parents=True, exist_ok=True)
     rig, entries = world.rig, []
-    for number, (frame, pattern) in enumerate(zip(images(world, light, patterns), declared or patterns, strict=True)):
+    for number, (frame, pattern) in enumerate(zip(images(world, moments or light, patterns), declared or patterns, strict=True)):
         name = f"{number:03d}.png"
         write_png(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16), srgb=False)
         entries.append(Frame(image=name, pattern=pattern).model_dump(mode="json", exclude_defaults=True))

@@ -43,6 +43,8 @@ class Case:
     """The second plane is on in every so many frames."""
     late: int = 0
     """Frames by which the declared planes are late."""
+    backwards: bool = False
+    """The planes are declared in reverse order."""
     turned_rad: float = 0.0
     """Angle by which they are turned."""
     accuracy_deg: float | None = None
@@ -83,6 +85,7 @@ CASES = (
     Case("a second plane in every eighth frame", cloth, planes=60, in_model=False, second=0.7, second_every=8),
     Case("a faint second plane in every fifth frame", grain, planes=60, in_model=False, second=0.2, second_every=5),
     Case("planes declared one frame late", cloth, planes=60, in_model=False, late=1),
+    Case("planes declared in reverse order", cloth, planes=60, in_model=False, backwards=True),
     Case("planes declared 1° aside", grain, planes=60, in_model=False, turned_rad=float(np.radians(1))),
     Case("planes declared 1° aside, accuracy_deg 1", grain, planes=60, turned_rad=float(np.radians(1)), accuracy_deg=1.0),
     Case("a second plane of a half on grain", grain, planes=40, in_model=False, second=0.5, second_rad=0.03),
@@ -147,9 +150,11 @@ def swept(case: Case, seed: int = 5) -> Trial:
             pixel = image.reshape(ROWS, DOWN, COLS, ACROSS).mean(axis=(1, 3)) + random.normal(0, NOISE, (ROWS, COLS))
             values = np.maximum(pixel + 0.05, 0).astype(np.float32)  # 0.05: a pedestal, so that noise is not cut
             exr.write(folder / f"{index:03d}.exr", dict.fromkeys("RGB", values), color_space="lin_rec709_scene", metadata={})
-            light = {"light": {"type": "off"}} if angle is None else {
-                "laser": {"type": "plane", "point_m": LASER.tolist(), "normal": plane_normal(
-                    angle + case.turned_rad + case.late * (last - first) / (case.planes - 1)).tolist()}}
+            light = {"light": {"type": "off"}}
+            if angle is not None:
+                declared = (first + last - angle if case.backwards else angle) + case.turned_rad
+                declared += case.late * (last - first) / (case.planes - 1)
+                light = {"laser": {"type": "plane", "point_m": LASER.tolist(), "normal": plane_normal(declared).tolist()}}
             if angle is not None and case.accuracy_deg is not None:
                 light["laser"]["accuracy_deg"] = case.accuracy_deg
             frames.append({"image": f"{index:03d}.exr", **light})

@@ -24,6 +24,15 @@ SHELF = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.
          Ball((0.2, -0.12, -1.3), 0.15, 0.5), Wall((0.12, 0.14, -1.2), (0.2, -0.3, 1), 0.6, half_m=(0.09, 0.07)))
 MIRRORS = (Wall((0, 0, -1.5), (-0.1, 0.1, 1), 0.7, texture=0.3), Wall((0, -0.3, 0), (0, 1, 0), 0.5, texture=0.2),
            Ball((-0.06, -0.1, -1.2), 0.15, mirror=True))
+MOVED_M = 0.024
+"""By how much a ball moves during the patterns."""
+WIDE, PIXEL = World(shapes=()).rig.camera[0], 1 / World(shapes=()).rig.camera_focal
+"""Columns of the camera, and the side of a pixel at 1 m."""
+NEAR_M = -1.08
+WIRES = (Wall((0, 0, -1.35), (0.2, 0.1, 1), 0.6, texture=0.3), *(
+    Wall((-0.28 + 0.08 * number, 0, NEAR_M), (0, 0, 1), 0.5, half_m=(width * PIXEL * -NEAR_M / 2, 0.5))
+    for number, width in enumerate((0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8))))
+"""Wires of some widths in pixels before a wall."""
 GRAY = binary_patterns(WIDTH, "column")
 PHASE_GRAY = (*phase_patterns("column", (16,), 4), *binary_patterns(WIDTH, "column", stripe_px=8))
 CODES: dict[str, Sequence[Pattern]] = {
@@ -92,6 +101,17 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES.get(name, ONE),
                    light)
 
+    for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "phase 16/18/21, 4 steps"):
+        moments = [trace(World(shapes=(SHELF[0], SHELF[1]._replace(center_m=(x, 0.05, -1.15)), *SHELF[2:])))
+                   for x in np.linspace(-0.15 - MOVED_M / 2, -0.15 + MOVED_M / 2, len(CODES[name]))]
+        yield _run(f"{name}, a ball moves by {1e3 * MOVED_M:g} mm", False, World(shapes=SHELF), CODES[name], light, moments=moments)
+    seen, bare = trace(World(shapes=WIRES, samples=6)), trace(World(shapes=WIRES[:1], samples=1)).depth
+    column = (np.arange(WIDE) + 0.5 - WIDE / 2) * PIXEL  # of the plane 1 m away, metres
+    beside = np.min([np.abs(column - wire.point_m[0] / -NEAR_M) for wire in WIRES[1:]], axis=0) < 1.5 * PIXEL
+    beside = np.broadcast_to(beside, bare.shape) & np.isfinite(bare)
+    for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "phase 16/18/21, 4 steps", "micro"):
+        yield _run(f"{name}, on wires of 0.4 to 1.8 px", False, World(shapes=WIRES), CODES[name],
+                   seen._replace(depth=bare), others=[np.full_like(bare, -NEAR_M)], near=beside)
     for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray", "micro"):
         for words, below in BELOW.items():
             yield _run(f"{name}, {words} below the surface", False, World(shapes=SHELF, **below), CODES[name], light)
@@ -128,13 +148,17 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
 
 
 def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,
-         declared: Sequence[Pattern] | None = None, *, refined: bool = False, **projector: object) -> Trial:
-    """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth."""
+         declared: Sequence[Pattern] | None = None, *, refined: bool = False, moments: Sequence[Light] | None = None,
+         others: Sequence[np.ndarray] = (), near: np.ndarray | None = None, **projector: object) -> Trial:
+    """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth.
+
+    `others`: further depths [rows, cols] that are right. `near`: the pixels [rows, cols] bool that count; None: all.
+    """
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
         light = write_capture(capture, world, patterns, light=light,
-                              declared=declared, **projector)
-        known = light.lit & np.isfinite(light.depth)
+                              declared=declared, moments=moments, **projector)
+        known = (light.lit if near is None else near) & np.isfinite(light.depth)
         try:
             found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=world.read_noise,
                                        photon_gain=1 / world.electrons, refine_projector=refined))
@@ -143,5 +167,6 @@ def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], l
             return Trial(name, in_model, nothing, nothing, nothing, nothing > 0, "mm", str(error).split(": ", 1)[-1])
     maps = found.maps
     assert maps.sigma is not None and maps.confidence is not None
-    return Trial(name, in_model, 1e3 * np.abs(maps.depth - light.depth)[known], 1e3 * maps.sigma[known], maps.confidence[known],
+    error = np.min([np.abs(maps.depth - truth) for truth in (light.depth, *others)], axis=0)
+    return Trial(name, in_model, 1e3 * error[known], 1e3 * maps.sigma[known], maps.confidence[known],
                  maps.mask[known], "mm", "; ".join(found.warnings))

@@ -2,8 +2,8 @@
 
 The reference period gives offset A, amplitude B and a phase. All other frames share A and B: the periods are so short that interreflection
 averages every pattern out, and so similar that defocus dims all of them alike. Every wrap of the reference predicts their readings, and the
-one whose misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance. Where χ² stays larger
-than noise makes it, as where a pixel sees two surfaces, the deviation grows with its root (Birge 1932).
+one whose misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance. Where χ² stays
+larger than noise makes it, as where a pixel sees two surfaces, the deviation grows with its root (Birge 1932).
 
 Source: Gupta and Nayar, "Micro Phase Shifting", CVPR 2012, equations 5 to 10.
 """
@@ -93,7 +93,7 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
                     wp.array(np.array(numbers)[order], dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec2, device=device),
                     wp.array(light_table(response), dtype=wp.float32, device=device),
                     wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1), dtype=wp.vec2, device=device),
-                    float(reference), float(member.sum()), float(extent), usual, wave_error_px**2, noise.read**2, noise.gain],
+                    float(reference), float(member.sum()), float(extent), float(free), usual, wave_error_px**2, noise.read**2, noise.gain],
                    [as_packs(array, device) for array in (scratch, *result)], device=device)
     return result
 
@@ -157,6 +157,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                      period: float,
                      shifts: float,  # frames of the reference
                      extent: float,
+                     free: float,  # readings more than unknowns
                      usual: float,  # sum of squares, in its variance, that noise seldom exceeds
                      wave_variance: float,
                      read_variance: float,
@@ -253,7 +254,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                     code = _MULTIPATH
             if keeps_place(code) and information[k] > 0.0 and place[k] >= -BORDER_PX and place[k] <= extent + BORDER_PX:
                 u_out[k] = place[k]
-                error[k] = wp.sqrt(wp.max(unexplained[k] / usual, 1.0) / information[k] + wave_variance)
+                error[k] = wp.sqrt(wp.where(unexplained[k] > usual, unexplained[k] / free, 1.0) / information[k] + wave_variance)
                 height[k] = swing[k]
             result[k] = wp.uint8(code)
         coordinate[p] = u_out

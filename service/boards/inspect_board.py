@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
+from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes, map_coordinates
 
 from kernels import device as devices
 from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
@@ -21,7 +21,7 @@ from service.boards.stitching.overlap import Evidence
 from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
 from service.boards.stitching.significance import Scan, compare, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
-from service.boards.tiles import BoardTiles, read_tiles
+from service.boards.tiles import BoardTiles, read_tiles, without_hidden_outliers
 from service.depth.base.solution import statistics
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -151,7 +151,11 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     first = blend(board.tiles, stitched, grid, progress=timings.advance)
     check_size(first, board.tiles, stitched, nominal)
     found = match(first, stitched, nominal, placement_m=request.placement_m)
-    heights = blend(board.tiles, stitched, grid, motion=found.motion, progress=lambda done: timings.advance(len(board.tiles) + done))
+    tiles = []
+    for tile, own in zip(board.tiles, stitched.motions.values, strict=True):
+        x, y, z = tile.moved(own + found.motion, centre=stitched.centre, length_m=stitched.length_m)
+        tiles.append(without_hidden_outliers(tile, z - map_coordinates(nominal.heights.height, grid.place(x, y), order=1, cval=np.nan)))
+    heights = blend(tiles, stitched, grid, motion=found.motion, progress=lambda done: timings.advance(len(tiles) + done))
     timings.stage("judge", 1)
     deviation = compare(heights, nominal.heights, shift_sigma_m=found.shift_sigma_m)
     plane = fit_form(grid, deviation.height, quadratic=False)

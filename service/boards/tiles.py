@@ -85,15 +85,30 @@ def _points(file: Path, tile: Tile, maps: DepthMaps, number: int) -> TilePoints:
     local = (points - middle).astype(np.float32)
     height, sigma = without_spikes(local[:, 2], maps.sigma[used] * along, used)
     return TilePoints(tile.path, local[:, 0], local[:, 1], height, sigma.astype(np.float32),
-                      middle + pose[:3, 3], _distance(points, used, where))
+                      middle + pose[:3, 3], _distance(points, used, where), used)
 
 
-def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def without_hidden_outliers(tile: TilePoints, deviation: np.ndarray) -> TilePoints:
+    """Return a tile with the outliers moved that steps of the board hide among its heights, and that stand out of its deviations from the
+    nominal heights, [n] metres, NaN where these are not known."""
+    known = np.isfinite(deviation)
+    pixels = tile.used.copy()
+    pixels[tile.used] = known
+    moved = int((tile.sigma > SPIKE * np.median(tile.sigma)).sum())
+    told, sigma = without_spikes(deviation[known].astype(np.float32), tile.sigma[known], pixels, known=moved)
+    z, wider = tile.z.copy(), tile.sigma.copy()
+    z[known] += told - deviation[known].astype(np.float32)
+    wider[known] = sigma
+    return tile._replace(z=z, sigma=wider)
+
+
+def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray, *, known: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return heights and σ, both [n], of the used pixels of a tile, [rows, cols], with outliers moved to their neighbours.
 
     An outlier lies beyond all of its eight neighbours but one by more than SPIKE σ. It is moved to the second of them, so that the slopes
     around it are not its own, and its σ grows by as much as it was moved. A group of outliers lies as far beyond all around it, and has
     no more pixels than groups have that come together by chance where so many are outliers; it is moved to the nearest of those around.
+    `known`: outliers that were found before.
     """
     image = np.full(used.shape, np.nan, dtype=np.float32)
     image[used] = height
@@ -104,18 +119,18 @@ def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> t
     groups = []
     for sign in (1, -1):
         up = np.where(used, sign * image, -np.inf).astype(np.float32)
-        second, fourth = (rank_filter(up, -1 - others, footprint=RING, mode="constant", cval=-np.inf) for others in (1, 3))
+        second, fifth = (rank_filter(up, -1 - others, footprint=RING, mode="constant", cval=-np.inf) for others in (1, 4))
         spike = used & np.isfinite(second) & (up > second + limit)
         single |= spike
         told[spike] = sign * second[spike]
-        marked = used & np.isfinite(fourth) & (up > fourth + limit)
+        marked = used & np.isfinite(fifth) & (up > fifth + limit)
         labels, count = label(marked, structure=np.ones((3, 3)))
         numbers = np.arange(1, count + 1)
         around = grey_dilation(np.where(marked, -np.inf, up), footprint=RING, mode="constant", cval=-np.inf)
         border = np.concatenate([[np.inf], np.atleast_1d(maximum(around, labels, numbers))]) if count else np.array([np.inf])
         base = np.concatenate([[-np.inf], np.atleast_1d(minimum(up - limit, labels, numbers))]) if count else np.array([-np.inf])
         groups.append((sign, labels, np.where(base > border, border, np.inf)))
-    most = _together(int(single.sum()), int(used.sum()))
+    most = _together(int(single.sum()) + known, int(used.sum()))
     for sign, labels, border in groups:
         small = (labels > 0) & np.isfinite(border[labels]) & (np.bincount(labels.ravel())[labels] <= most)
         told[small] = sign * border[labels[small]]

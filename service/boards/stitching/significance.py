@@ -25,6 +25,8 @@ from service.boards.stitching.grid import BEND_NOISE, HeightMap, bends, robust_s
 CLIP = 6.0
 ENOUGH_WINDOWS = 100
 """The least number of windows whose spread says what their errors are."""
+MOST_WINDOWS, WIDEST, HALVINGS = 200_000, 1000.0, 10
+"""The number of windows that are looked at for it, the largest factor by which they may scatter more, and the halvings that find it."""
 LEAST_MEASURED = 0.5
 """The least part of a window that must be measured."""
 LEAST_CARRIED, LEAST_PART = 3, 0.25
@@ -119,7 +121,7 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
             both = _sums(weight * shared, side) / total
             sigma = np.where(usable, np.hypot(own, both), np.nan)
             allowed = np.where(usable, _sums(weight * tolerance, side) / total, 0)
-            middle, spread[side] = _scatter(value / sigma, usable & (own > sigma / 2), usable)
+            middle, spread[side] = _scatter(value, own, both, usable & (own > sigma / 2), usable)
             wide = np.where(usable, np.hypot(spread[side] * own, both), np.nan)  # what neighbours share is no noise, and scatters no more
             beyond = np.where(usable, np.minimum((np.abs(value) - allowed) / sigma, np.abs(value - middle * own) / wide), 0)
         if side == sides[0] and side >= LEAST_CARRIED:
@@ -150,13 +152,22 @@ def _carried_by_few(heights: np.ndarray, known: np.ndarray, mean: np.ndarray, wi
     return out
 
 
-def _scatter(values: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
-    """Return the middle of the means of windows over their σ, and their robust standard deviation, 1 at the least: of those with more noise
-    than shared error, if there are enough of them."""
-    taken = values[quiet] if quiet.sum() >= ENOUGH_WINDOWS else values[usable]
-    if taken.size < ENOUGH_WINDOWS:
+def _scatter(value: np.ndarray, own: np.ndarray, both: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
+    """Return the middle of the means of windows over their noise, and the factor of the noise, 1 at the least, with which noise and shared
+    error together explain their robust scatter: of those with more noise than shared error, if there are enough of them."""
+    taken = quiet if quiet.sum() >= ENOUGH_WINDOWS else usable
+    if taken.sum() < ENOUGH_WINDOWS:
         return 0.0, 1.0
-    return float(np.median(taken)), max(robust_sigma(taken), 1.0)
+    step = -(-int(taken.sum()) // MOST_WINDOWS)
+    value, own, both = (values[taken][::step] for values in (value, own, both))
+    middle = float(np.median(value / np.hypot(own, both)))
+    low, high = 1.0, 1.0
+    while high < WIDEST and robust_sigma(value / np.hypot(high * own, both)) > 1:
+        low, high = high, 2 * high
+    for _ in range(HALVINGS if high > 1 else 0):
+        factor = (low + high) / 2
+        low, high = (factor, high) if robust_sigma(value / np.hypot(factor * own, both)) > 1 else (low, factor)
+    return middle, high
 
 
 def region_of(deviation: HeightMap, scan: Scan, part: np.ndarray) -> np.ndarray:

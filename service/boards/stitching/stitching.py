@@ -40,6 +40,8 @@ class TilePoints(NamedTuple):
     origin: np.ndarray  # [3] float64 metres
     pixel_m: float
     """The distance of neighbouring points."""
+    used: np.ndarray
+    """[rows, cols] bool: the pixels of the points."""
 
     def moved(self, motion: np.ndarray, *, centre: tuple[float, float], length_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x, y and z after a motion, [n] float64 metres."""

@@ -81,7 +81,7 @@ class Lags(NamedTuple):
     size: np.ndarray  # [rows, cols] projector pixels, NaN where too little is decoded
     deviation: np.ndarray  # [rows, cols] of noise
     error: np.ndarray  # [rows, cols] by how much the place is off if light from below the surface makes the lag
-    most: np.ndarray  # [rows, cols] lag that the dimming of fine waves against wider ones allows; NaN where nothing tells it
+    most: np.ndarray  # [rows, cols] lag that the dimming of fine waves against wide stripes allows; NaN where nothing tells it
 
     def beyond(self, sigmas: float) -> np.ndarray:
         """Return where the lag is larger than so many standard deviations, and not larger than light from nearby makes, [rows, cols] bool:
@@ -208,8 +208,7 @@ def _wave_lag(means: np.ndarray, count: np.ndarray, phase: PhaseCode) -> Lags:
     size, deviation = means[0] / weight, np.sqrt(np.maximum(means[2], 0) / np.maximum(count, 1)) / weight
     dimmed = np.maximum(-means[3] / np.maximum(means[4], 1e-30), 0)  # change of the amplitude's logarithm with that of the frequency
     usual = float(np.exp(np.log(phase.periods_px).mean())) / (2 * np.pi)
-    most = np.pi / 2 * dimmed * usual
-    return Lags(size, deviation, np.hypot(size, most), most)
+    return Lags(size, deviation, np.hypot(size, np.pi / 2 * dimmed * usual), np.full_like(size, np.nan))
 
 
 def _edge_sums(grey: np.ndarray, place: np.ndarray, code: BinaryCode, phase: PhaseCode, collected: Collected) -> np.ndarray:

@@ -24,6 +24,14 @@ def test_good_prints_pass_with_missing_pixels_outliers_and_a_bent_board(station)
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("seed", [3, 18, 23, 45, 46])
+def test_what_a_spline_leaves_and_outliers_side_by_side_are_no_defects(station, seed):
+    """Each was, where the noise alone was taken to scatter more than its σ says, and five outliers that touch hid each other."""
+    kind = KINDS[1]
+    assert station.inspect(kind.board(seed), seed, with_regions=False, **kind.options).verdict is not Verdict.FAIL
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_of_prints_are_found(station, fault):
     for seed in range(400, 402):

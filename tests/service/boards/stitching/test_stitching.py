@@ -20,7 +20,7 @@ def points(views: list[View]) -> list[TilePoints]:
         x, y = np.meshgrid((np.arange(cols) + 0.5 - cols / 2) * PIXEL, (rows / 2 - np.arange(rows) - 0.5) * PIXEL)
         there = np.isfinite(view.height)
         out.append(TilePoints(f"t{number}", *(values[there].astype(np.float32) for values in (x, y, view.height)),
-                              np.full(int(there.sum()), SIGMA, np.float32), np.array([*view.told, 0.0]), PIXEL))
+                              np.full(int(there.sum()), SIGMA, np.float32), np.array([*view.told, 0.0]), PIXEL, there))
     return out
 
 

@@ -64,7 +64,7 @@ def test_other_matter(relit, tmp_path, light, name, scattered, scatter_px, fligh
         {}, {"blur_px": 2.0}, {"light": 0.3}, {"read_noise": 0.006, "electrons": 2500.0}))])
 def test_matt_things_have_neither(relit, tmp_path, light, name, world):
     off, said = solve(relit, tmp_path, light, PATTERNS[name], **world)
-    assert not said and 0.5 < np.median(off) < 1.1
+    assert not said and 0.4 < np.median(off) < 1.1
 
 
 def test_light_that_bounces_between_matt_walls_has_neither(relit, tmp_path):

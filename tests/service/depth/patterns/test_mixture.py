@@ -40,5 +40,5 @@ def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(relit, tmp_
     solved = maps.mask & near & np.isfinite(wall)
     assert solved.sum() > 300
     off = np.minimum(np.abs(maps.depth - wall), np.abs(maps.depth + NEAR))[solved] / maps.sigma[solved]
-    # 0; a wave and Gray code 0.007, and 0.27 without what its bits tell; micro 0.003, and 0.13 without what its fit leaves unexplained
+    # 0; a wave and Gray code 0.007, and 0.27 without what its bits tell; micro 0.002, and 0.13 without what its fit leaves unexplained
     assert (off > 5).mean() < 0.03
