@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy import angles_deg
+from benchmarks.trials.declared import reflect
 from benchmarks.trials.trial import Trial
 from kernels.status import SOLVED
 from service.requests.solve import Method, SolveRequest
@@ -45,6 +46,12 @@ def trials(data: Path | None) -> Iterator[Trial]:
             radiance = under_lights(normal[mask], directions, PLASTIC)
             yield solved(f"reference, plastic with a {name} ball", right, normal, mask, radiance, lights,
                          method=Method.REFERENCE, reference_ball=Path(folder) / "ball")
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "ball", sphere, disc, under_lights(sphere[disc], directions, (0.6, 1.0, 0.0)), lights)
+        toward = np.broadcast_to(directions[:, None], (len(directions), int(mask.sum()), 3))
+        radiance = 0.5 / np.pi * np.stack([reflect("velvet", normal[mask], way) for way in toward], axis=1)
+        yield solved("reference, velvet with a matt ball", False, normal, mask, np.repeat(radiance[..., None], 3, axis=2), lights,
+                     method=Method.REFERENCE, reference_ball=Path(folder) / "ball")
 
 
 def solved(name: str, in_model: bool, normal: np.ndarray, mask: np.ndarray, radiance: np.ndarray, lights: list[dict[str, Any]],

@@ -244,8 +244,8 @@ def _check_one(waves: Waves, sample: Sample, model: ProjectorModel | None, axis:
     beyond = [words for change, words in OFFSETS if words in possible and not -high <= change <= low]
     ways = [f"-{360 * low:.0f}° to +{360 * high:.0f}°", *beyond]
     return None, (f"are one wave, whose offset_rad nothing in the capture confirms: changed by {' or '.join(ways)} it would fit as "
-                  "well, and all depths would be others, which the standard deviations do not hold; frames that hold part of the next one "
-                  "change it, and so does what moves: add a Gray code, the other axis, or a second period")
+                  "well, and all depths would be others, which the standard deviations do not hold; frames that hold part of the next one, "
+                  "what moves and light that bounces between surfaces change it: add a Gray code, the other axis, or a second period")
 
 
 def _last_that_fits(sign: int, state: Callable[[float], tuple[bool, float]]) -> float:
