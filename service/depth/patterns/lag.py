@@ -37,8 +37,8 @@ CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""
 WIDESPREAD_SIGMAS, WIDESPREAD = 2.0, 0.4
-"""Lag in its standard deviations, and part of all pixels that have one beyond, from which on light runs below surfaces whatever the
-directions: noise makes one at a twentieth, and texture under a lens out of focus at a tenth."""
+"""Lag in its standard deviations, and part of all pixels that have one beyond and are dimmed as much, from which on light runs below
+surfaces whatever the directions: noise makes one at a twentieth, and texture under a lens out of focus at a tenth."""
 EDGE_TIMES, DIMMED_TIMES = 2.0, 0.7
 """What the lag of stripes, and the width of light that dims a wave as much as it is dimmed, count as a standard deviation of the place:
 between what is right for light that runs near and far."""
@@ -95,7 +95,7 @@ class Lags(NamedTuple):
         found = self.size[self.beyond(CLEAR_SIGMAS) & (np.abs(self.size) > CLEAR_PX)]
         one_way = bool(found.size) and abs(np.sign(found).mean()) >= 2 * ONE_WAY - 1
         if found.size < CLEAR_SHARE * known.sum() or not one_way:
-            found = self.size[self.beyond(WIDESPREAD_SIGMAS)]
+            found = self.size[self.beyond(WIDESPREAD_SIGMAS) & (np.abs(self.size) <= self.most)]
             if not found.size or found.size < WIDESPREAD * known.sum() or np.median(np.abs(found)) < CLEAR_PX / 2:
                 return None
         return float(np.median(np.abs(found))), found.size / known.sum()
