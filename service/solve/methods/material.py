@@ -36,7 +36,7 @@ from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.parts import Material
 from service.solve.methods.diffuse import APART, pair_starts
-from service.solve.methods.settling import as_shown, settle
+from service.solve.methods.settling import as_shown, middles_of, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
 from stage.colour.colour import GREY_WEIGHTS
 
@@ -191,13 +191,14 @@ class _Walk:
                              parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or not self._options.settling:
             return light
-        light, shown = as_shown(light, self.result.normal, self._pick)
+        middles = middles_of(light, self._pick)
+        light, shown = as_shown(light, self.result.normal, middles)
         if shown is not None:
             self.result.facts["bounced_light"] = {"shown": round(shown, 3), "taken_out": light.arriving is not None}
         if light.arriving is None or self._field is not None or not self._supported:
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
-        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
+        settled = settle(light, self.result.normal, self._shape, self._pick, middles, relative=relative)
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
         return settled.light

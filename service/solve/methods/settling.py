@@ -45,24 +45,39 @@ class Settled(NamedTuple):
                 "from_shadows": round(self.scale.scale, 4), "stray_light": round(self.scale.stray, 5), "readings": self.scale.readings}
 
 
-def as_shown(light: DirectLight, normal: np.ndarray, pick: Callable[[np.ndarray], Samples]) -> tuple[DirectLight, float | None]:
+class Middles(NamedTuple):
+    """The solved pixels in square blocks, and one pixel of each block."""
+
+    solved: np.ndarray  # [pixels] bool
+    block: np.ndarray  # [solved] number of the block of each
+    pixels: np.ndarray  # [blocks] position of the pixel nearest to the middle of each
+    readings: np.ndarray  # [blocks, lights] of that pixel
+
+
+def middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Middles:
+    """Return the middles of the blocks of an object. `pick`: gives the readings of a few pixels by their positions."""
+    solved = light.solved.numpy() > 0
+    block, pixels = _blocks(np.flatnonzero(solved), light.given.camera.width)
+    return Middles(solved, block, pixels, readings_of(pick(pixels)))
+
+
+def as_shown(light: DirectLight, normal: np.ndarray, middles: Middles) -> tuple[DirectLight, float | None]:
     """Return the light of a first search without its arriving part where shadows show none; and what they show, of `shown_bounce`.
-    `normal`: [3, pixels], as for `settle`, as `pick` is."""
-    middles = _blocks(np.flatnonzero(light.solved.numpy() > 0), light.given.camera.width)[1]
-    shown = shown_bounce(*readings_in_shadow(light, middles, normal[:, middles].T, readings_of(pick(middles))))
+    `normal`: [3, pixels]."""
+    shown = shown_bounce(*readings_in_shadow(light, middles.pixels, normal[:, middles.pixels].T, middles.readings))
     return (light if has_bounced(light, shown) else light._replace(arriving=None)), shown
 
 
-def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
+def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], within: Middles, *,
+           relative: bool) -> Settled:
     """Find the light that an object throws on itself from the surface without it.
-    `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
-    positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
+    `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: as for `middles_of`, of which `within` is.
+    `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     assert light.arriving is not None
-    solved = light.solved.numpy() > 0
+    solved, block, middles, whole = within
     pixels = np.flatnonzero(solved)
-    block, middles = _blocks(pixels, light.given.camera.width)
     first, albedo, start = normal, light.albedo, normal[:, middles].T
-    turned, whole = start, readings_of(pick(middles))
+    turned = start
     for _ in range(ROUNDS):
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole)) if relative else None
         light = light._replace(albedo_scale=_value(fit))
