@@ -26,7 +26,7 @@ CLIP = 6.0
 ENOUGH_WINDOWS = 100
 """The least number of windows whose spread says what their errors are."""
 MOST_WINDOWS, WIDEST, HALVINGS = 200_000, 1000.0, 10
-"""The number of windows that are looked at for it, the largest factor by which they may scatter more, and the halvings that find it."""
+"""Most windows from which that is taken, the largest factor by which they may scatter more than noise, and the halvings that find it."""
 LEAST_MEASURED = 0.5
 """The least part of a window that must be measured."""
 LEAST_CARRIED, LEAST_PART = 3, 0.25
@@ -153,7 +153,7 @@ def _carried_by_few(heights: np.ndarray, known: np.ndarray, mean: np.ndarray, wi
 
 
 def _scatter(value: np.ndarray, own: np.ndarray, both: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
-    """Return the middle of the means of windows over their noise, and the factor of the noise, 1 at the least, with which noise and shared
+    """Return the middle of the means of windows over their σ, and the factor of the noise, 1 at the least, with which noise and shared
     error together explain their robust scatter: of those with more noise than shared error, if there are enough of them."""
     taken = quiet if quiet.sum() >= ENOUGH_WINDOWS else usable
     if taken.sum() < ENOUGH_WINDOWS:
