@@ -19,7 +19,7 @@ from stage.patterns.modulated import modulated_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.patterns.ramp import ramp_patterns
 
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT, NARROW = 320, 240, 256
 SHELF = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.05, -1.15), 0.12, 0.8, texture=0.3),
          Ball((0.2, -0.12, -1.3), 0.15, 0.5), Wall((0.12, 0.14, -1.2), (0.2, -0.3, 1), 0.6, half_m=(0.09, 0.07)))
 MIRRORS = (Wall((0, 0, -1.5), (-0.1, 0.1, 1), 0.7, texture=0.3), Wall((0, -0.3, 0), (0, 1, 0), 0.5, texture=0.2),
@@ -96,6 +96,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
     yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), ONE, light)
     yield _run(f"phase {WIDTH}, 3 steps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), ONE, light)
+    for name in ("Gray, inverses", "phase 16/18/21, 4 steps", f"phase {WIDTH}, 3 steps"):
+        yield _run(f"{name}, projector declared as {NARROW} columns", False, World(shapes=SHELF), CODES.get(name, ONE), light,
+                   resolution=[NARROW, HEIGHT], principal_px=[NARROW / 2, HEIGHT / 2])
     for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3), ("Gray, white and black", 0.45),
                        (f"phase {WIDTH}, 3 steps", 0.1), (f"phase {WIDTH}, 3 steps", 0.3)):
         yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES.get(name, ONE),

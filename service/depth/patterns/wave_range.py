@@ -1,4 +1,4 @@
-"""Waves of several periods that go on beyond the declared border of the projector, whose places there would be taken for others inside.
+"""Waves that go on beyond the declared border of the projector, whose places there would be taken for others inside.
 
 Where a surface crosses that border, the phases of its neighbouring pixels are those of one row of columns on both sides of it. Noise, blur
 and bounced light make no such row.
@@ -23,11 +23,13 @@ NEAR = 0.25
 """Largest step between neighbouring pixels of one surface, shortest periods."""
 BESIDE_PERIODS = 0.5
 """Shortest periods by which a surface must go on to both sides of the border: more than noise and blur."""
+ONE_WAVE_PART = 1 / 8
+"""Part of the period that counts as the shortest one for both, of one wave that is wider than the projector."""
 
 
 def check_range(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
     """Return a sentence if surfaces go on beyond the border of the projector, which has the exponent of its waves where they are bent."""
-    for code in unnumbered(collected, least_periods=2):
+    for code in unnumbered(collected):
         waves = waves_of(sample, code, projector, noise)
         if waves is not None and (farthest := _farthest(waves)) is not None:
             return (f"frames: the {code.axis} phases go on beyond the {waves.extent} {code.axis}s of the projector, to about "
@@ -43,9 +45,13 @@ def _farthest(waves: Waves) -> float | None:
         return None
     shortest = float(waves.periods.min())
     place = np.full(waves.clear.shape, np.nan)
-    misfit, place[waves.clear] = joint_fit(waves.turns[:, waves.clear], waves.periods, looked_at)
-    limit = FITS * np.maximum(MISFIT, NOISE_TIMES * waves.deviation[waves.clear])
-    place[waves.clear] = np.where(misfit < limit, place[waves.clear], np.nan)
+    if len(waves.periods) == 1:
+        place[waves.clear] = waves.turns[0, waves.clear] % 1 * shortest
+        shortest *= ONE_WAVE_PART
+    else:
+        misfit, found = joint_fit(waves.turns[:, waves.clear], waves.periods, looked_at)
+        limit = FITS * np.maximum(MISFIT, NOISE_TIMES * waves.deviation[waves.clear])
+        place[waves.clear] = np.where(misfit < limit, found, np.nan)
     rows, ends, beside = 0, [], BESIDE_PERIODS * shortest
     for line in place:
         joined = np.abs(np.diff(line)) < NEAR * shortest

@@ -136,3 +136,14 @@ def test_waves_that_go_on_beyond_the_projector_are_named(declared, gamma):
     else:
         assert found is not None and f"beyond the {declared} columns" in found and "projector.resolution" in found
         assert 330 < float(found.split("about ")[1].split(":")[0]) <= EXTENT
+
+
+@pytest.mark.parametrize("period", [EXTENT, 1.1 * EXTENT, 1.5 * EXTENT])
+@pytest.mark.parametrize("declared", [250, 300, EXTENT, 500])
+def test_one_wave_that_goes_on_beyond_the_projector_is_named(declared, period):
+    wave = phase_patterns("column", (period,), 3)
+    found = check_range(frames_of(wave), collect(list(wave)), PatternProjector((declared, ROW_EXTENT)), NOISE)
+    if declared >= EXTENT:
+        assert found is None
+    else:
+        assert found is not None and f"beyond the {declared} columns" in found
