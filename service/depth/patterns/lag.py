@@ -48,8 +48,6 @@ periods are counted wrongly."""
 NEAR_PART, FAR_PART = 0.25, 0.5
 """Distances of pixels from the edge of a stripe, as parts of the finest stripe, that tell where the edge crosses the mean of white and
 black, and where half of the light has come."""
-EVEN = 0.5
-"""Least spread of pixels about an edge, as a part of that of pixels all along: those of one side alone do not tell where it is."""
 MIDDLE = 0.4
 """Middle of a stripe, as a part of it, where its edges are far."""
 UNKNOWN = np.nan, 0.0, 0.0, np.nan
@@ -92,8 +90,9 @@ class Lags(NamedTuple):
         """Return the usual size of the lags that are clear, and their part of the decoded pixels; None where they show no light below
         surfaces."""
         known = np.isfinite(self.size)
-        found = self.size[self.beyond(CLEAR_SIGMAS) & (np.abs(self.size) > CLEAR_PX)]
-        one_way = bool(found.size) and abs(np.sign(found).mean()) >= 2 * ONE_WAY - 1
+        large = np.abs(self.size) > np.maximum(CLEAR_SIGMAS * self.deviation, CLEAR_PX)
+        one_way = large.any() and abs(np.sign(self.size[large]).mean()) >= 2 * ONE_WAY - 1
+        found = self.size[large & self.beyond(CLEAR_SIGMAS)]
         if found.size < CLEAR_SHARE * known.sum() or not one_way:
             found = self.size[self.beyond(WIDESPREAD_SIGMAS) & (np.abs(self.size) <= self.most)]
             if not found.size or found.size < WIDESPREAD * known.sum() or np.median(np.abs(found)) < CLEAR_PX / 2:
@@ -241,12 +240,11 @@ def _edge_sums(grey: np.ndarray, place: np.ndarray, code: BinaryCode, phase: Pha
 
 def _edge_lag(means: np.ndarray, count: np.ndarray, code: BinaryCode, phase: PhaseCode) -> Lags:
     """Return the lag of the place where white and black are equal, or of that where half of the light has come, whichever is larger."""
-    found, known = [], np.ones(means.shape[1:], bool)
-    for (ones, *others), even in ((means[4:10], (NEAR_PART * code.stripe_px) ** 2 / 3), (means[10:], 2 / 3)):
+    found = []
+    for ones, *others in (means[4:10], means[10:]):
         number = np.maximum(ones, 1e-12)
         run, square, step, product, power = (each / number for each in others)
         spread = np.maximum(square - run**2, 1e-12)
-        known = known & (spread > EVEN * even)
         slope = np.maximum((product - run * step) / spread, 1e-3)
         level = step - slope * run
         rest = np.maximum(power - step**2 - slope**2 * spread, 0)
@@ -262,8 +260,7 @@ def _edge_lag(means: np.ndarray, count: np.ndarray, code: BinaryCode, phase: Pha
     fine = np.where(means[3] > 0, means[2] / np.maximum(means[3], 1e-30), np.nan)  # against stripes as wide as its period
     _, width = _wider_bit(code, phase)
     most = np.maximum(-np.log(np.maximum(fine, 1e-3)), 0) / np.log(2 * width / phase.periods_px[0]) * phase.periods_px[0] / 4
-    return Lags(np.where(known, size, np.nan), np.where(larger, near_error, far_error),
-                np.hypot(EDGE_TIMES * size, DIMMED_TIMES * wide), most)
+    return Lags(size, np.where(larger, near_error, far_error), np.hypot(EDGE_TIMES * size, DIMMED_TIMES * wide), most)
 
 
 def _wider_bit(code: BinaryCode, phase: PhaseCode) -> tuple[int, float]:
