@@ -1,0 +1,127 @@
+"""A light-stage turntable end to end: the commands, the surface and its normals against the truth, and pictures of unseen views by Blender.
+
+    python samples/make_turntable.py --out DIR
+    python -m benchmarks.turntable DIR [--write docs/scans.md] [--picture docs/turntable.png]
+
+The three commands run as processes of their own. Blender opens the asset as it is imported; it must be installed (`make clients`).
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.clients.comparison import compare
+from benchmarks.clients.render import Client, Programs, Sun
+from benchmarks.file_mutations import write_between
+from service.relight.sheet import write_sheet
+from service.scans.fusion.fuse import ASSET_FILE, MESH_FILE
+from service.scans.points.ply_points import read_ply_points
+from stage.capture.camera import Camera
+from stage.formats import exr
+
+START, END = "<!-- made by benchmarks.turntable -->", "<!-- end of the turntable -->"
+ROOT = Path(__file__).resolve().parents[1]
+MM = 1e3
+SAMPLES = 256
+"""Paths of each pixel in Blender."""
+REACH_M = 0.002
+"""Distance beyond which there is no fused surface at a place, metres."""
+COMMANDS = (("solve", "views", "--no-temporal", "--out", "solved"), ("depth", "views", "--no-temporal", "--out", "depth"),
+            ("fuse", "scan-set.json", "--join-normals", "--out", "fused"))
+
+
+class Errors(NamedTuple):
+    """The errors of a fused surface."""
+
+    vertices: int
+    out: np.ndarray  # [V] metres, of the vertices from the true surface
+    back: np.ndarray  # [P] metres, of what the pixels of all views show from the fused surface
+    angle: np.ndarray  # [Q] degrees, of the normals of the fused surface where it is within REACH_M of what the pixels show
+
+
+def run(folder: Path) -> list[tuple[str, float, float]]:
+    """Run the three commands, and return the text, the seconds and the seconds of processors of each."""
+    rows = []
+    for words in COMMANDS:
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        program = [sys.executable, "-m", "service.cli.main"]
+        subprocess.run(program + list(words), cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        rows.append((f"relit {' '.join(words)}", time.perf_counter() - began,
+                     after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime))
+    return rows
+
+
+def surface_errors(folder: Path) -> Errors:
+    """Measure the fused surface. Distances are along the normal of the nearest vertex, of the truth (edges of a quarter of a millimetre)
+    or of the surface (voxels as fine)."""
+    found, truth = read_ply_points(folder / "fused" / MESH_FILE), np.load(folder / "truth.npz")
+    assert found.normals is not None
+    _, nearest = cKDTree(truth["points"]).query(found.points)
+    out = np.abs(np.einsum("nx,nx->n", found.points - truth["points"][nearest], truth["normals"][nearest]))
+    seen = truth["seen_points"]
+    distance, near = cKDTree(found.points).query(seen)
+    there = distance < REACH_M
+    back = np.where(there, np.abs(np.einsum("nx,nx->n", seen - found.points[near], found.normals[near])), distance)
+    angle = np.degrees(np.arccos(np.clip(np.einsum("nx,nx->n", found.normals[near], truth["seen_normals"]), -1, 1)))
+    return Errors(len(found.points), out, back, angle[there])
+
+
+def pictures(folder: Path) -> list[list[tuple[str, np.ndarray]]]:
+    """Return each unseen view as path traced and as Blender shows the asset, with titles that say the error."""
+    unseen = json.loads((folder / "unseen.json").read_text())
+    rows = []
+    with Programs() as programs:
+        for view in unseen["views"]:
+            truth = np.stack([exr.read(folder / view["image"])[0][channel] for channel in "RGB"], axis=-1).astype(np.float32)
+            camera = Camera.model_validate(unseen["camera"] | {"world_from_camera": view["world_from_camera"]})
+            shown = programs.render(Client.BLENDER, folder / "fused" / ASSET_FILE, camera,
+                                    Sun(tuple(view["direction"]), tuple(view["irradiance"])), samples=SAMPLES)
+            error = compare(shown, truth, (truth.max(axis=-1) > 0) | (shown[..., 3] > 0), scaled=False).rmse
+            rows.append([("path traced", truth), (f"Blender: {error:.3f}", np.ascontiguousarray(shown[..., :3]))])
+    return rows
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{values.mean():.3f}; {np.median(values):.3f}; {np.percentile(values, 99):.3f}"
+
+
+def main() -> None:
+    """Run, measure, and write what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, help="folder that samples/make_turntable.py has written")
+    parser.add_argument("--write", type=Path, help="page to put the table into")
+    parser.add_argument("--picture", type=Path, help="PNG to write")
+    args = parser.parse_args()
+    commands = run(args.folder)
+    found = surface_errors(args.folder)
+    rows = pictures(args.folder)
+    errors = [title.split()[-1] for (_, _), (title, _) in rows]
+    table = ["| command | seconds | of processors |", "|---|---|---|",
+             *(f"| `{text}` | {taken:.0f} | {busy:.0f} |" for text, taken, busy in commands), "",
+             "| | |", "|---|---|",
+             f"| vertices | {found.vertices} |",
+             f"| surface from the truth: mean; median; 99 % | {_spread(MM * found.out)} mm |",
+             f"| truth in sight from the surface: mean; median; 99 % | {_spread(MM * found.back)} mm |",
+             f"| Chamfer distance, mean of both | {MM * (found.out.mean() + found.back.mean()) / 2:.3f} mm |",
+             f"| normals: mean; median; 99 % | {_spread(found.angle)}° |",
+             f"| unseen views in Blender, RMSE over the mean | {'; '.join(errors)} |"]
+    text = "\n".join(table)
+    print(text)
+    if args.write:
+        write_between(args.write, START, END, text)
+    if args.picture:
+        write_sheet(args.picture, [[each for row in rows for each in row]], height=300)
+
+
+if __name__ == "__main__":
+    main()
