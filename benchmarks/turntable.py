@@ -76,10 +76,18 @@ def surface_errors(folder: Path) -> Errors:
     return Errors(len(found.points), out, back, angle[there])
 
 
-def pictures(folder: Path) -> list[list[tuple[str, np.ndarray]]]:
-    """Return each unseen view as path traced and as Blender shows the asset, with titles that say the error."""
+class Shown(NamedTuple):
+    """An unseen view."""
+
+    truth: np.ndarray  # [rows, cols, 3] linear, path traced
+    picture: np.ndarray  # [rows, cols, 3] linear, the asset in Blender
+    error: float  # RMSE over the mean of the truth
+
+
+def unseen_views(folder: Path) -> list[Shown]:
+    """Return each unseen view as path traced and as Blender shows the asset."""
     unseen = json.loads((folder / "unseen.json").read_text())
-    rows = []
+    views = []
     with Programs() as programs:
         for view in unseen["views"]:
             truth = np.stack([exr.read(folder / view["image"])[0][channel] for channel in "RGB"], axis=-1).astype(np.float32)
@@ -87,8 +95,8 @@ def pictures(folder: Path) -> list[list[tuple[str, np.ndarray]]]:
             shown = programs.render(Client.BLENDER, folder / "fused" / ASSET_FILE, camera,
                                     Sun(tuple(view["direction"]), tuple(view["irradiance"])), samples=SAMPLES)
             error = compare(shown, truth, (truth.max(axis=-1) > 0) | (shown[..., 3] > 0), scaled=False).rmse
-            rows.append([("path traced", truth), (f"Blender: {error:.3f}", np.ascontiguousarray(shown[..., :3]))])
-    return rows
+            views.append(Shown(truth, np.ascontiguousarray(shown[..., :3]), error))
+    return views
 
 
 def _spread(values: np.ndarray) -> str:
@@ -104,8 +112,7 @@ def main() -> None:
     args = parser.parse_args()
     commands = run(args.folder)
     found = surface_errors(args.folder)
-    rows = pictures(args.folder)
-    errors = [title.split()[-1] for (_, _), (title, _) in rows]
+    views = unseen_views(args.folder)
     table = ["| command | seconds | of processors |", "|---|---|---|",
              *(f"| `{text}` | {taken:.0f} | {busy:.0f} |" for text, taken, busy in commands), "",
              "| | |", "|---|---|",
@@ -114,13 +121,14 @@ def main() -> None:
              f"| truth in sight from the surface: mean; median; 99 % | {_spread(MM * found.back)} mm |",
              f"| Chamfer distance, mean of both | {MM * (found.out.mean() + found.back.mean()) / 2:.3f} mm |",
              f"| normals: mean; median; 99 % | {_spread(found.angle)}° |",
-             f"| unseen views in Blender, RMSE over the mean | {'; '.join(errors)} |"]
+             f"| unseen views in Blender, RMSE over the mean | {'; '.join(f'{view.error:.3f}' for view in views)} |"]
     text = "\n".join(table)
     print(text)
     if args.write:
         write_between(args.write, START, END, text)
     if args.picture:
-        write_sheet(args.picture, [[each for row in rows for each in row]], height=300)
+        write_sheet(args.picture, [[pair for view in views for pair in
+                                    (("path traced", view.truth), (f"Blender: {view.error:.3f}", view.picture))]], height=300)
 
 
 if __name__ == "__main__":

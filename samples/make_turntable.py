@@ -1,6 +1,6 @@
 """Render a light-stage turntable: twelve views of the owl at half its size, each with its lamps and a projector's patterns, and the truth.
 
-    python samples/make_turntable.py --out turntable        # about 12 minutes on 2 idle cores, outside the repository
+    python samples/make_turntable.py --out turntable        # about 10 minutes on 2 idle cores, outside the repository
 
 `views/000` … `views/330` are captures by one perspective camera, of the object turned by that many degrees: 32 distant lights, then
 phase shifting of three periods, white and black, with shot and read noise. `scan-set.json` names the results that `relit solve` and
@@ -135,7 +135,7 @@ def render_view(mi, shapes: dict, folder: Path, turn: float, spp: int) -> None:
         "projector": devices.model_dump(mode="json", exclude_none=True), "mask": "mask.png", "frames": entries})
 
 
-def with_truth(mi, shapes: dict, surfaces: dict, path: Path, turns: list[float]) -> None:
+def write_truth(mi, shapes: dict, surfaces: dict, path: Path, turns: list[float]) -> None:
     """Write the meshes, and what the pixels of all views show of them: points and normals, in the frame of the table at 0 degrees."""
     scene = mi.load_dict({"type": "scene", **shapes})
     row, column = np.mgrid[:SIZE_PX, :SIZE_PX]
@@ -148,7 +148,7 @@ def with_truth(mi, shapes: dict, surfaces: dict, path: Path, turns: list[float])
         normals.append(np.array(si.sh_frame.n).T[inside])
     np.savez(path, points=np.concatenate([part.points for part in surfaces.values()]),
              normals=np.concatenate([part.normals for part in surfaces.values()]), seen_points=np.concatenate(points),
-             seen_normals=np.concatenate(normals), seen_by=np.repeat(np.arange(len(turns)), [len(each) for each in points]))
+             seen_normals=np.concatenate(normals))
 
 
 def main() -> None:
@@ -178,7 +178,7 @@ def main() -> None:
         capture_files.write_rgb(args.out / f"{name}.exr", image, note="an unseen view, path traced")
         unseen.append({"image": f"{name}.exr", "world_from_camera": pose.round(12).tolist(), "direction": lamp.tolist(),
                        "irradiance": [IRRADIANCE] * 3})
-    with_truth(mi, shapes, surfaces, args.out / "truth.npz", turns)
+    write_truth(mi, shapes, surfaces, args.out / "truth.npz", turns)
     capture_files.write_json(args.out / "unseen.json", {"camera": camera().model_dump(mode="json", exclude_none=True), "views": unseen})
     capture_files.write_json(args.out / "scan-set.json", {
         "schema": "relit.scan-set/1", "name": "owl on a turntable",
