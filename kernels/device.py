@@ -16,6 +16,7 @@ from functools import cache, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 import warp as wp
 
 from kernels.errors import ArrayError, DeviceError
@@ -285,6 +286,15 @@ def load_for_cuda(kernel: Any, device: str) -> None:
     from kernels import ahead  # knows all kernels, whose modules know this one
 
     wp.force_load(device, ahead.package_of(kernel), block_dim=CUDA_BLOCK, max_workers=worker_count())
+
+
+def to_numpy(array: wp.array) -> np.ndarray:
+    """Return an array of any device on the host: a copy, of the CPU's a view; waits for the launches before.
+
+    Warp's own `numpy()` makes the null stream that of the device while it copies, for all threads: two that read at the same time may
+    leave it so, and graphs cannot be captured in it. It would also wait for the uploads of other streams.
+    """
+    return (array if array.device.is_cpu or not array.size else wp.clone(array, device="cpu")).numpy()
 
 
 def has_graphs(device: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.fusion.projection import View, depth_of, image_point, line_of_sight, pixel_metres, sight_start, to_camera
 from kernels.fusion.views import ALONG, TILE, TRUNCATION_VOXELS, WIDER, Cell, ViewArrays, truncation
 
@@ -98,7 +99,7 @@ def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], b
     marked = wp.zeros((side, side, side), dtype=wp.uint8, device=device)
     low = wp.vec3(*(float(voxel * c) for c in corner))
     devices.launch(_mark_kernel, len(views.cells), [voxel, low, views.views, views.cells], [marked], device=device, uneven=True)
-    z, y, x = np.nonzero(marked.numpy())
+    z, y, x = np.nonzero(to_numpy(marked))
     index = np.full((side, side, side), -1, dtype=np.int32)
     index[z, y, x] = np.arange(len(x), dtype=np.int32)
     place = wp.array(np.stack([x, y, z], axis=-1).astype(np.int32), dtype=wp.vec3i, device=device)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.fusion.bricks import BLOCK, VOXELS
 from kernels.fusion.integrate import SURFACE, Volume, Voxels, voxel_number, voxel_position
 
@@ -250,16 +251,16 @@ def extract(volume: Volume) -> Triangles:
     devices.launch(_vertex_kernel, count, [voxels, crossed, vertex_start], [points, sigma, edge], device=device)
     devices.launch(_face_kernel, count, [voxels, crossed, vertex_start, cases, face_start, triangles, edges,
                                          wp.array(EDGE_CORNER, dtype=int, device=device)], [corner_numbers], device=device)
-    corners = corner_numbers.numpy()
+    corners = to_numpy(corner_numbers)
     used = np.zeros(vertex_count, dtype=bool)
     used[corners] = True
     renumbered = np.cumsum(used, dtype=np.int32) - 1
-    return Triangles(points.numpy()[used], sigma.numpy()[used], edge.numpy()[used], renumbered[corners].reshape(-1, 3))
+    return Triangles(to_numpy(points)[used], to_numpy(sigma)[used], to_numpy(edge)[used], renumbered[corners].reshape(-1, 3))
 
 
 def _starts(counts: Any, device: str) -> tuple[Any, int]:
     """Return the sums of the counts before each, in place, and the sum of all."""
-    last = int(counts[-1:].numpy()[0])
+    last = int(to_numpy(counts[-1:])[0])
     starts = wp.empty_like(counts)
     wp.utils.array_scan(counts, starts, inclusive=False)
-    return starts, int(starts[-1:].numpy()[0]) + last
+    return starts, int(to_numpy(starts[-1:])[0]) + last

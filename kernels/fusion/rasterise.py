@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 
 EDGE = 1.0e-5
 """The largest distance of a texel outside of a triangle, in barycentric coordinates, so that none is missed between two triangles."""
@@ -54,7 +55,7 @@ def rasterise(texture: np.ndarray, faces: np.ndarray, rows: int, cols: int, *, d
     devices.launch(_rasterise_kernel, len(faces), [wp.array(texture.astype(np.float32), dtype=wp.vec2, device=device),
                                                    wp.array(faces.astype(np.int32), dtype=int, device=device), rows, cols], [covered],
                    device=device, uneven=True)
-    found = covered.numpy()
+    found = to_numpy(covered)
     row, col = np.nonzero(found >= 0)
     a, b, c = (texture[faces[found[row, col], corner]].astype(np.float64) for corner in range(3))
     p = np.stack([col + 0.5, row + 0.5], axis=-1)

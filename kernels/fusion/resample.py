@@ -21,6 +21,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 
 REACH = 3
 """Pixels to each side of a pixel whose points are looked at."""
@@ -186,7 +187,7 @@ def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: 
     nearest: Any = wp.full(rows * cols, -1, dtype=int, device=device)
     devices.launch(_resample_kernel, rows * cols, [rows, cols, focal, wp.array(start, dtype=int, device=device), uploaded(places),
                                                    uploaded(measured)], [depth, sigma, nearest], device=device)
-    found = nearest.numpy()
+    found = to_numpy(nearest)
     known = found >= 0
-    return Resampled(depth.numpy().reshape(shape), sigma.numpy().reshape(shape),
+    return Resampled(to_numpy(depth).reshape(shape), to_numpy(sigma).reshape(shape),
                      np.where(known, order[np.where(known, found, 0)], -1).astype(np.int32).reshape(shape))

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.fusion.bricks import BLOCK, Blocks
 from kernels.fusion.integrate import EMPTY, SURFACE, Volume, Voxels, voxel_number
 from kernels.fusion.projection import View, image_point, in_front, line_of_sight, sight_start, to_camera, turned_back
@@ -68,7 +69,7 @@ def residuals(volume: Volume, views: ViewArrays) -> tuple[np.ndarray, np.ndarray
     distance: Any = wp.zeros(count, dtype=float, device=blocks.device)
     fate: Any = wp.zeros(count, dtype=wp.uint8, device=blocks.device)
     devices.launch(_residual_kernel, count, [volume.voxels(), views.views, views.cells], [distance, fate], device=blocks.device)
-    return distance.numpy(), fate.numpy()
+    return to_numpy(distance), to_numpy(fate)
 
 
 @wp.kernel(enable_backward=False)
@@ -108,4 +109,4 @@ def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, va
         skipped, reach, views.measured(),
         *(wp.array(values.astype(np.float32), dtype=kind, device=device) for values, kind in (
             (points, wp.vec3), (normals, wp.vec3), (variance, float)))], [distance, expected], device=device, uneven=True)
-    return distance.numpy(), expected.numpy()
+    return to_numpy(distance), to_numpy(expected)

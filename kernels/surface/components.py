@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.surface.grid import Grid
 
 
@@ -172,7 +173,7 @@ def place(
     total = wp.zeros(count, dtype=wp.float64, device=device)
 
     def component_mean() -> np.ndarray:
-        return (np.bincount(runs.label, weights=total.numpy()) / pixels)[runs.label]
+        return (np.bincount(runs.label, weights=to_numpy(total)) / pixels)[runs.label]
 
     devices.launch(_sum_runs, count, [there, value], [total], device=device)
     mean = per_run(component_mean(), wp.float64)

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.spread import MAD_TO_SIGMA
 from kernels.surface.conjugate import Convergence
 from kernels.surface.fragments import CELLS_AT_ONCE, Fragments, cut
@@ -122,7 +123,7 @@ def loop_noise(slopes: Slopes, *, grid: Grid) -> float:
     stride += 1 - stride % 2 if stride > 1 else 0
     samples = wp.zeros(-(-count // stride), dtype=wp.float32, device=grid.device)
     devices.launch(_sample_loops, samples.shape[0], [*slopes, start, stride], [samples], device=grid.device)
-    loops = samples.numpy()
+    loops = to_numpy(samples)
     loops = loops[loops >= 0.0]
     return MAD_TO_SIGMA * float(np.sqrt(np.median(loops))) if loops.size else 0.0
 
@@ -141,8 +142,8 @@ def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: floa
     """
     noise = loop_noise(slopes, grid=grid)
     lowered = distrust_loops(slopes, noise=noise, grid=grid)
-    whole, left = ((w.right.numpy(), w.down.numpy()) for w in (slopes.weights, lowered.weights))
-    found = cut(surface, (slopes.right.numpy(), slopes.down.numpy()), whole, left, grid=grid, spacing=spacing)
+    whole, left = ((to_numpy(w.right), to_numpy(w.down)) for w in (slopes.weights, lowered.weights))
+    found = cut(surface, (to_numpy(slopes.right), to_numpy(slopes.down)), whole, left, grid=grid, spacing=spacing)
     return Breaks(lowered, noise, found, np.where(found.way == 1, left[1][found.first], left[0][found.first]))
 
 
@@ -158,11 +159,11 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     edges = (found.way, found.first)
     _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
     solve(lowered, height, last=False)
-    parts = connect(found, height.numpy(), noise=noise)
+    parts = connect(found, to_numpy(height), noise=noise)
     _set(lowered.weights, edges, np.where(parts.between, 0.0, kept))
     height.zero_()  # the tolerance is relative to the first residual
     convergence = solve(lowered, height, last=True)
-    heights = height.numpy()
+    heights = to_numpy(height)
     added = np.append(assemble(found, parts, heights), 0.0).astype(np.float32)  # 0 for the label -1
     for first in range(0, len(heights), CELLS_AT_ONCE):
         cells = slice(first, first + CELLS_AT_ONCE)
@@ -174,7 +175,7 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
 def _set(weights: EdgeWeights, edges: tuple[np.ndarray, np.ndarray], values: np.ndarray) -> None:
     """Set the weights of edges, given as (0 right or 1 down, cell)."""
     for way, plane in enumerate((weights.right, weights.down)):
-        changed = plane.numpy()
+        changed = to_numpy(plane)
         mine = edges[0] == way
         changed[edges[1][mine]] = values[mine]
         plane.assign(changed)

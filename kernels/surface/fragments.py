@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.surface.components import join
 from kernels.surface.grid import Grid
 from kernels.surface.normal_map import NormalMap, PixelNormals
@@ -105,7 +106,7 @@ def _pieces(count: int) -> Iterator[slice]:
 
 def _turned(surface: NormalMap, there: np.ndarray, grid: Grid) -> np.ndarray:
     """Return [2, size] bool, the edges at which the normals turn abruptly, and not as a thin round rod does."""
-    turn = [angle.numpy() for angle in pair_turns(surface, grid=grid)]
+    turn = [to_numpy(angle) for angle in pair_turns(surface, grid=grid)]
     stride = max(1, grid.size // TURNS)
     while math.gcd(stride, grid.pitch) > 1:  # else a few columns alone would tell
         stride += 1

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
 from kernels.surface.conjugate import Convergence, Solver
@@ -123,13 +124,13 @@ def integrate_normals(
 def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -> None:
     """Take edges away, in place; `cuts`: [rows, cols] bool, edges to the right and edges down."""
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
-        kept = plane.numpy()
+        kept = to_numpy(plane)
         kept[: grid.pitch * (grid.rows + 2)].reshape(-1, grid.pitch)[1 : grid.rows + 1, 1 : grid.cols + 1][cut] = 0
         plane.assign(kept)
 
 
 def _on_host(a: np.ndarray | wp.array) -> np.ndarray:
-    return a if isinstance(a, np.ndarray) else a.numpy()
+    return a if isinstance(a, np.ndarray) else to_numpy(a)
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:
@@ -153,7 +154,7 @@ def _check(normal: Any, mask: Any, x: Any, y: Any, sigma: Any, *, perspective: b
         raise ArrayError(f"mean_z is {mean_z}: give a finite height")
     if perspective and mean_z >= 0.0:
         raise ArrayError(f"mean_z is {mean_z}, and a perspective camera looks along −z: give a negative one")
-    if 0 in mask.shape or not (mask if isinstance(mask, np.ndarray) else mask.numpy()).any():
+    if 0 in mask.shape or not (mask if isinstance(mask, np.ndarray) else to_numpy(mask)).any():
         raise ArrayError("mask is empty: mark the pixels that show the surface")
 
 

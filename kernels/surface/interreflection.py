@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.surface.shadows import Camera, Projection, between_pixels, project
@@ -120,7 +121,7 @@ def gather_light(
                     upload(tree.area, wp.float32), upload(tree.radius, wp.float32), upload(tree.following, wp.int32),
                     upload(tree.patch, wp.int32), upload(sent.reshape(-1, packs, VALUES), pack), float(opening), height, mask,
                     projection.on_device()], [arriving], device=device, uneven=True)
-    return arriving.numpy().reshape(count, -1)[:, :values]
+    return to_numpy(arriving).reshape(count, -1)[:, :values]
 
 
 def _interleave(number: np.ndarray) -> np.ndarray:

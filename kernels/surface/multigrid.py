@@ -23,6 +23,9 @@ from kernels import device as devices
 from kernels.device import Recorded
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, make_grid, record
 
+# as in conjugate
+wp.set_module_options({"fuse_fp": False})
+
 COARSEST = 2
 """Side, in pixels, of the coarsest level: smoothing alone solves it."""
 BRIEF_CELLS = 8191

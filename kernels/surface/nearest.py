@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 
 
@@ -64,8 +65,8 @@ class NearestOnMesh:
         if count:
             given = wp.array(self._scaled(points), dtype=wp.vec3, device=self._device)
             devices.launch(_nearest, count, [self._mesh.id, given, within / self._size], [face, share, side], device=self._device)
-        two = share.numpy().astype(np.float64)
-        return Nearest(face.numpy(), np.column_stack([two, 1 - two.sum(axis=1)]), side.numpy() > 0)
+        two = to_numpy(share).astype(np.float64)
+        return Nearest(to_numpy(face), np.column_stack([two, 1 - two.sum(axis=1)]), to_numpy(side) > 0)
 
     def _scaled(self, points: np.ndarray) -> np.ndarray:
         return ((points - self._middle) / self._size).astype(np.float32)

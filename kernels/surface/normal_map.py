@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 
 HALF = 0.17453293
 """Standard error, radians (ten degrees), at which the weight of a pair is halved. Between 5° and 20° heights differ by a thirtieth of their
@@ -179,7 +180,7 @@ class NormalMap:
         ray = np.stack([plane[place] for plane in (self._x, self._y)]).astype(np.float32)
         if self._sigma is not None and len(row):
             line = self._floats(normal[:, None]), *(self._floats(values[None]) for values in (_radians(self._sigma[place]), *ray))
-            normal = supported_normals(*line, perspective=self.perspective, device=self.device).normal.numpy()[:, 0]
+            normal = to_numpy(supported_normals(*line, perspective=self.perspective, device=self.device).normal)[:, 0]
         normal, ray = (np.where(inside, np.nan_to_num(values), 0) for values in (normal, ray))
         return PixelNormals(normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9), ray)
 

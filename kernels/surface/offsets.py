@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.shadows import (
     FIRST_STEP,
@@ -227,9 +228,9 @@ def weigh_offsets(
     blur: float,  # standard deviation of the gaps, in the same unit
 ) -> Evidence:
     """Return the likelihood of offsets between -reach and reach. Waits for the device."""
-    highest, hidden = shadows.highest.numpy(), shadows.hidden.numpy()
+    highest, hidden = to_numpy(shadows.highest), to_numpy(shadows.hidden)
     told = (highest > NO_GAP) & (hidden == 0) & (odds != 0)
-    gaps = [highest[told], shadows.lowest.numpy()[told], shadows.back.numpy()[told]]
+    gaps = [highest[told], to_numpy(shadows.lowest)[told], to_numpy(shadows.back)[told]]
     mine = np.broadcast_to(on_part[:, None], told.shape)[told]
     whose = np.broadcast_to(group[None], told.shape)[told]
     # a part that nears comes before others' pixels: free, hidden, then these lie behind its front, then behind its back; its own pixels

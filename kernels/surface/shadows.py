@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
+
 MARGIN_PIXELS = 0.3
 """Height above the marched line, in pixels, that the surface must exceed to hide the light."""
 MARGIN_SLOPE = 0.02
@@ -77,7 +79,7 @@ def relief_of(height: wp.array, mask: wp.array, projection: Projection, extent: 
     """Return the `Relief` of a surface on the device; its extent is found where it is not given."""
     relief = Relief()
     relief.height, relief.mask, relief.camera = height, mask, projection.on_device()
-    relief.box, relief.highest = extent or extent_of(height.numpy(), mask.numpy())
+    relief.box, relief.highest = extent or extent_of(to_numpy(height), to_numpy(mask))
     return relief
 
 

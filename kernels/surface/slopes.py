@@ -28,7 +28,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.surface.grid import EdgeWeights, Grid
 from kernels.surface.normal_map import NormalMap
 
@@ -167,7 +167,7 @@ def pair_slopes(surface: NormalMap, *, grid: Grid, spacing: float) -> tuple[Slop
     for band in surface.bands():
         inputs = [band.first, band.normal, band.usable, band.x, band.y, band.trust, spacing]
         devices.launch(_edge_kernel(surface.perspective), band.rows * grid.cols, inputs, list(slopes), device=grid.device)
-        usable[band.first : band.first + band.rows] = band.usable.numpy()[: band.rows]
+        usable[band.first : band.first + band.rows] = to_numpy(band.usable)[: band.rows]
     return slopes, usable
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.packs import Band
 from kernels.relight.basis.basis import Basis, gram, principal, projection, squared_residual
@@ -83,12 +84,12 @@ def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: 
     functions[:, :lights] = np.swapaxes(basis.matrix, 1, 2)
     left = np.zeros(3)
     for each in stack_bands(source, device, 3 * 12 * count, timings, "layers"):
-        coefficients = combine_batch(each.band, weights).numpy()
+        coefficients = to_numpy(combine_batch(each.band, weights))
         width = each.span.stop - each.span.start
         for k, layer in enumerate(layers):
             layer[:, each.span] = np.where(each.inside, coefficients[k], 0)[:, :width]
             coefficients[k, :, :width] = layer[:, each.span]  # rounded as it is stored: what is left is what the file leaves
-        squares = squared_residual(each.band, gains, coefficients, functions).numpy()
+        squares = to_numpy(squared_residual(each.band, gains, coefficients, functions))
         left += squares[:, each.inside].sum(axis=1, dtype=np.float64)
     timings.stage("write", 1)
     rows, cols = source.capture.camera.height, source.capture.camera.width
@@ -153,7 +154,7 @@ class Model(NamedTuple):
 
     def fit(self, shown: Band) -> tuple[np.ndarray, np.ndarray | None]:
         """Return coefficients [terms, 3 or 1, pixels padded] float32, and for a luminance its colour [3, pixels padded] uint8."""
-        fitted = combine_batch(shown, self.weights).numpy()
+        fitted = to_numpy(combine_batch(shown, self.weights))
         if self.kind != BasisKind.LRGB_PTM:
             return fitted, None
         luminance = separate(fitted, self.functions[self.display.front] * WHITE)
@@ -163,7 +164,7 @@ class Model(NamedTuple):
         """Return Σ (what a viewer shows − display value)² over channels, lights and the pixels inside."""
         in_colour = coefficients if colour is None else coefficients * (colour / np.float32(WHITE))
         functions = np.broadcast_to(self.functions, (3, *self.functions.shape))
-        squares = squared_residual(shown, (self.display.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0).numpy()
+        squares = to_numpy(squared_residual(shown, (self.display.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0))
         return float(squares[:, inside].sum(dtype=np.float64))
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
 from service.calibrate.results import digits, manifests_to_replace, write_results
@@ -210,7 +211,7 @@ def _stripes(signal: Signal, albedo: np.ndarray | None, device: str) -> Iterator
     """Yield the points of a stripe that is looked for along rows, then along columns: u, v and the number of the line of each, [n]."""
     for along in ("row", "column"):
         stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)
-        centre, status = stripe.centre.numpy(), stripe.status.numpy()
+        centre, status = to_numpy(stripe.centre), to_numpy(stripe.status)
         lines = np.flatnonzero(status == Status.OK)
         across, down = centre[lines].astype(np.float64), lines + 0.5
         yield (across, down, lines) if along == "row" else (down, across, lines)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
@@ -113,8 +114,8 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
             part = u[band].shape
             count = part[0] * part[1]
             first, second = (axis for axis in axes if axis is not None)
-            u[band], v[band] = (axis.coordinate.numpy()[:count].reshape(part) for axis in (first, second))
-            decoded[band] = np.logical_and(*(np.isin(axis.status.numpy()[:count], SOLVED).reshape(part) for axis in (first, second)))
+            u[band], v[band] = (to_numpy(axis.coordinate)[:count].reshape(part) for axis in (first, second))
+            decoded[band] = np.logical_and(*(np.isin(to_numpy(axis.status)[:count], SOLVED).reshape(part) for axis in (first, second)))
     lit = projector_corners(corners, u, v, decoded, request.board)
     kept = np.flatnonzero(np.isfinite(lit).all(axis=-1))
     seen = int(np.isfinite(corners).all(axis=-1).sum())

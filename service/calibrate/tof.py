@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.tof.continuous.continuous import decode
 from service.depth.tof.continuous_wave import estimate_noise
 from service.depth.tof.tof import solve_tof, z_per_range
@@ -136,7 +137,7 @@ def _harmonics(plan: Sweep, captures: list[Capture], device: str, timings: Timin
         found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise,
                        saturation=capture.manifest.saturation, scale=frames.scale, device=device)
         true = _true_half_path(step, capture).reshape(-1)[some]
-        phase, sigma = found.phase.numpy()[:, some], found.sigma.numpy()[:, some]
+        phase, sigma = to_numpy(found.phase)[:, some], to_numpy(found.sigma)[:, some]
         for row, hz in enumerate(found.modulation_hz.tolist()):
             good = (sigma[row] > 0) & (sigma[row] < SHARPEST_RAD)
             phases.setdefault(hz, []).append(phase[row, good].astype(np.float64))

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.status import SOLVED
 from kernels.tof.histogram.pileup import correct_pileup, place, without_pileup
 from kernels.tof.histogram.pulse_width import estimate_pulse
@@ -114,9 +115,9 @@ def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndar
             histograms = correct_pileup(counts, pulses=pile_up.pulses)
             shape = estimate_pulse(histograms, photons)
     found = find_returns(histograms, shape.pulse, most=MOST_RETURNS)
-    there = (found.photons.numpy() > 0) & np.isin(found.status.numpy(), SOLVED)
+    there = (to_numpy(found.photons) > 0) & np.isin(to_numpy(found.status), SOLVED)
     number, index = np.nonzero(there)
-    time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s
+    time_s = waveforms.start_s + to_numpy(found.position)[number, index].astype(np.float64) * waveforms.bin_s
     facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{shape.sigma * waveforms.bin_s:.4g}"),
              "shots_with_several_returns": int(there[1].sum())}
-    return index, range_of_delay_m(time_s), found.photons.numpy()[number, index], facts, warnings
+    return index, range_of_delay_m(time_s), to_numpy(found.photons)[number, index], facts, warnings

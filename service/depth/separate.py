@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.status import OK, Status
 from kernels.structured.pattern_frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
@@ -190,10 +191,10 @@ def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposu
                                    black=place[black[0]] if black else None, leak=request.black_level) for sinusoid in sinusoids]
             shape = mask[band].shape
             pixels = mask[band].size
-            worst = np.maximum.reduce([part.status.numpy()[:pixels] for part in parts]).reshape(shape)
+            worst = np.maximum.reduce([to_numpy(part.status)[:pixels] for part in parts]).reshape(shape)
             light.status[band] = np.where(mask[band], worst, int(Status.UNSOLVED))
             for whole, arrays in ((light.direct, [part.direct for part in parts]), (light.indirect, [part.indirect for part in parts])):
-                mean = np.mean([array.numpy()[:, :pixels] for array in arrays], axis=0).reshape(3, *shape)
+                mean = np.mean([to_numpy(array)[:, :pixels] for array in arrays], axis=0).reshape(3, *shape)
                 if planes.exposure is not None:
                     mean /= planes.exposure[band]
                 whole[band] = np.where((light.status[band] == OK)[..., None], np.moveaxis(mean, 0, -1), 0)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from kernels.surface.slopes import STEEPEST
@@ -76,7 +77,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
                               mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
                               options=IntegrationOptions(discontinuities=True), device=device, progress=progress)
     assert found.part is not None
-    base = plane.to_heights(found.height.numpy().astype(np.float64), solved)
+    base = plane.to_heights(to_numpy(found.height).astype(np.float64), solved)
     part = np.where(solved, found.part, -1)
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
@@ -99,7 +100,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     unplaced = solved & ~placed
     if unplaced.any():
         known_z = z[placed].mean() if placed.any() else mean_z
-        z = np.where(unplaced, found.height.numpy() + (known_z - mean_z), z)
+        z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   None if relief == 0 else left / relief)
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, Display, srgb, stack_bands
 from service.errors import RequestError
@@ -135,7 +136,7 @@ def _write_pictures(images: _Images, pictures: list[_Picture], source: BasisCapt
     pyramids = [images.pyramid(picture.name) for picture in pictures]
     with Strips(images.height, images.width, pyramids, np.zeros((len(pictures), 3), np.uint8)) as strips:
         for each in stack_bands(source, device, 6 * source.stack.shape[1] + 30 * len(weights), timings, "tiles"):
-            values = np.where(each.inside, combine_batch(display.shown(each.band), weights).numpy(), 0)
+            values = np.where(each.inside, to_numpy(combine_batch(display.shown(each.band), weights)), 0)
             width = each.span.stop - each.span.start
             strips.put(each.span.start, np.rint(255 * np.clip(values[:, :, :width], 0, 1)).astype(np.uint8).swapaxes(1, 2))
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, Display, stack_bands
 from service.publish.components import Components, components_of
@@ -56,7 +57,7 @@ def write_planes(folder: Path, source: BasisCapture, display: Display, sample: n
     bytes_per_pixel = 6 * source.stack.shape[1] + 20 * len(fit)  # display values, and planes in their stages
     with Strips(camera.height, camera.width, pyramids, quantization.zero.astype(np.uint8).reshape(-1, 3)) as strips:
         for each in stack_bands(source, device, bytes_per_pixel, timings, "tiles"):
-            fitted = combine_batch(display.shown(each.band), weights).numpy().sum(axis=1)
+            fitted = to_numpy(combine_batch(display.shown(each.band), weights)).sum(axis=1)
             stored = quantize(np.where(each.inside, fitted, 0), quantization)[:, :each.span.stop - each.span.start]
             strips.put(each.span.start, stored.reshape(images, 3, -1).swapaxes(1, 2))
     timings.stage("write", 1)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.images import ImagesOnDevice
 from kernels.relight.frames.combine import combine, combine_batch
 from kernels.relight.frames.halves import to_halves
@@ -76,7 +77,7 @@ def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Se
     for start, stop in bands:
         band = images.band(start, stop, saturated=False)
         summed = combine(band, weights[0]).reshape((1, channels, -1)) if places is None else combine_batch(band, placed)
-        found = (to_halves(summed) if halved else summed).numpy()[kept]
+        found = to_numpy(to_halves(summed) if halved else summed)[kept]
         if frames is None:
             frames = found
         else:

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.images import ImagesOnDevice
 from kernels.packs import Band
@@ -103,7 +104,7 @@ class Guide:
         sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
             taken = take(self._captured(batch, self._recorded, self._visible(batch)))
-            sums[:, done : done + len(batch.pixels)] = taken.numpy()[:, : len(batch.pixels)]
+            sums[:, done : done + len(batch.pixels)] = to_numpy(taken)[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
@@ -129,7 +130,7 @@ class Guide:
             visible = self._visible(batch)
             for light in np.flatnonzero(channels[:, :count].any(axis=(0, 2))):
                 alone = captured_lights(lights.direction, np.where(np.arange(count)[:, None] == light, lights.irradiance, 0))
-                told = shade(batch.surface, alone, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1).sum(axis=0)
+                told = to_numpy(shade(batch.surface, alone, visible))[:, : len(batch.pixels)].reshape(2, 3, -1).sum(axis=0)
                 read = values[:, light].astype(np.float32) * stack.scale[light]
                 short = np.where(channels[:, light], np.maximum(told - read, 0), 0)
                 at = np.flatnonzero(short.any(axis=0))
@@ -208,8 +209,8 @@ class Guide:
                                         use)
             done += len(batch.pixels)
         if halves:
-            return np.stack([to_halves(radiance[place]).numpy() for place in places])[..., :count], None
-        frames, mirror = (each.numpy()[list(places) if len(each) else [], :, :count] for each in (radiance, mirrored))
+            return np.stack([to_numpy(to_halves(radiance[place])) for place in places])[..., :count], None
+        frames, mirror = (to_numpy(each)[list(places) if len(each) else [], :, :count] for each in (radiance, mirrored))
         return frames, mirror if specular else None
 
     @cached_property
@@ -234,7 +235,7 @@ class Guide:
         visible = self._visible(batch, light.marched)
 
         def lit(sources: Sources) -> np.ndarray:
-            return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
+            return to_numpy(shade(batch.surface, sources, visible))[:, : len(batch.pixels)].reshape(2, 3, -1)
 
         wanted = lit(light.wanted)
         given = sum_shown(self._captured(batch, self.images, visible, band), light.captured)
@@ -284,10 +285,10 @@ class Guide:
     def _near_part(self, batch: ModelBatch, visible: wp.array, fine: Sources, coarse: Sources) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
         count = len(batch.pixels)
-        wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
+        wanted = to_numpy(shade(batch.surface, fine, visible))[:, :count].reshape(2, 3, -1)
         captured = self._captured(batch, self.images, visible)
         summed = sum_near(captured, coarse, triangles_between(self._lights.direction))
-        pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
+        pictures, told = to_numpy(summed)[:, :count].reshape(2, 3, -1)
         return wanted, pictures, told
 
     def _visible(self, batch: ModelBatch, marched: np.ndarray = NOTHING) -> wp.array:

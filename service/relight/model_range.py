@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.relight.directions.direction_grid import direction_grid
 from kernels.relight.model.beyond import followed
@@ -223,7 +224,7 @@ def _summed(portion: Portion, albedo: np.ndarray, grid: Responses, facing: np.nd
     for lights, horizons in zip(light.small, portion.horizons, strict=True):
         if horizons is not None:
             visible = see_above(lights.direction, portion.surface, horizons)
-            small = shade_frames(portion.surface, lights.sources, visible).numpy()[..., :count].reshape(-1, 2, 3, count)
+            small = to_numpy(shade_frames(portion.surface, lights.sources, visible))[..., :count].reshape(-1, 2, 3, count)
             matt[lights.frames] += small[:, 0]
             gloss[lights.frames] += small[:, 1]
     positive = energy._replace(weights=np.maximum(energy.weights, 0))
@@ -235,7 +236,7 @@ def _summed(portion: Portion, albedo: np.ndarray, grid: Responses, facing: np.nd
         outside = light.beyond.broad.at(facing)
         shine = outside.gloss(grid.gloss, count)
         whole = outside.matt(grid, albedo) + shine
-        small = shade_frames(portion.surface, light.beyond.small, portion.visible).numpy()[..., :count].reshape(-1, 2, 3, count)
+        small = to_numpy(shade_frames(portion.surface, light.beyond.small, portion.visible))[..., :count].reshape(-1, 2, 3, count)
         stands_in = light.beyond.captured.matt(captured, albedo) + light.beyond.captured.gloss(captured.gloss, count)
         beyond = LitBeyond(whole + small.sum(axis=1), shine + small[:, 1], stands_in)
     return LitModel(matt, gloss, energy.matt(captured, albedo) + energy.gloss(shown, count), ratio, added, beyond)

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from kernels import packs
+from kernels.device import to_numpy
 from kernels.relight.directions.direction_grid import direction_grid, spread
 from kernels.relight.frames.combine import combine_rows, sum_rows, upload_weights
 from kernels.relight.model.beyond import share_beyond
@@ -121,12 +122,12 @@ class FrameEnergy(NamedTuple):
     def matt(self, responses: Responses, albedo: np.ndarray) -> np.ndarray:
         """Return [frames, 3, n] the diffuse part of the radiance of pixels of an albedo [3, n]."""
         count, _, terms = self.weights.shape
-        sums = combine_rows(responses.matt, self.weights.reshape(3 * count, 1, terms)).numpy().reshape(count, 3, -1)
+        sums = to_numpy(combine_rows(responses.matt, self.weights.reshape(3 * count, 1, terms))).reshape(count, 3, -1)
         return np.asarray(albedo * sums[self.places, :, : albedo.shape[1]])
 
     def gloss(self, rows: wp.array, count: int) -> np.ndarray:
         """Return [frames, 3, count] the specular part of the radiance, from rows as of Responses.gloss."""
-        return np.asarray(combine_rows(rows, self.weights).numpy()[self.places, :, :count])
+        return np.asarray(to_numpy(combine_rows(rows, self.weights))[self.places, :, :count])
 
 
 class SmallLights(NamedTuple):

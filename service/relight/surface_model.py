@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.relight.model.shading import PLANES, SecondLobe, Surface, upload_surface
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
@@ -168,7 +169,7 @@ class SurfaceModel:
     @cached_property
     def _field(self) -> HeightField:
         """The height on the device, for finding horizons."""
-        return height_field(self._height.numpy(), self._mask.numpy() != 0, self._projection, self.device)
+        return height_field(to_numpy(self._height), to_numpy(self._mask) != 0, self._projection, self.device)
 
 
 def _by_normal(pixels: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:

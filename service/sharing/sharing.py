@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.relight.frames import cublas
 from service.errors import DivergedError
 from service.reporting.provenance import versions
@@ -229,7 +230,7 @@ def digest(value: object) -> str:
 
 def _add(value: object, add: Callable[[bytes], None]) -> None:
     if isinstance(value, wp.array):
-        value = value.numpy()
+        value = to_numpy(value)
     if isinstance(value, np.ndarray):
         add(f"{value.dtype}{value.shape}".encode())
         add(np.ascontiguousarray(value).tobytes())

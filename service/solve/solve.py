@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
@@ -118,7 +119,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     sigma = solution.sigma  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
-        solution.height = None if solution.integration is None else solution.integration.height.numpy()
+        solution.height = None if solution.integration is None else to_numpy(solution.integration.height)
     placement = place_solution(given, opened.lights, solution) if isinstance(opened.lights, DistantLights) else None
     if placement is not None:
         solution.height = placement.height

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.relight.model.shading import shade
 from kernels.relight.model.sources import NEVER, Sources
 from service.relight.surface_model import ModelBatch, SurfaceModel
@@ -137,9 +138,9 @@ def _lit(model: SurfaceModel, batch: ModelBatch, sources: Sources, scale: float)
     values = np.empty((pixels, count, 3), dtype=np.float16)
     for light in range(count):
         one = Sources(*(plane[light : light + 1] for plane in sources))
-        lit = shade(batch.surface, one, visible).numpy()[:, :pixels]
+        lit = to_numpy(shade(batch.surface, one, visible))[:, :pixels]
         values[:, light] = np.minimum((lit[:3] + lit[3:]) / scale, np.finfo(np.float16).max).T
-    seen = visible.numpy().reshape(count, -1)[:, :pixels].T != 0
+    seen = to_numpy(visible).reshape(count, -1)[:, :pixels].T != 0
     assert model.maps.normal is not None
     normal, point = model.maps.normal.reshape(-1, 3)[batch.pixels], model.places(batch.pixels)
     place, is_near = sources.place[:, :3], sources.place[:, 3]

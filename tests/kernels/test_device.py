@@ -57,6 +57,18 @@ def test_launches_from_many_threads(device):
         assert all((visits == 1).all() for visits in pool.map(one, range(40)))
 
 
+def test_many_threads_read_and_graphs_are_captured_afterwards(device):
+    """With Warp's own numpy(), the null stream, in which nothing can be captured, stays that of a GPU after some dozen reads."""
+    values = wp.array(np.arange(4096), dtype=int, device=device)
+    with ThreadPoolExecutor(4) as pool:
+        assert all((read == np.arange(4096)).all() for read in pool.map(lambda _: devices.to_numpy(values), range(400)))
+    visits = wp.zeros(4096, dtype=int, device=device)
+    work = devices.Repeated(lambda: devices.launch(count_visits, 4096, [1], [visits], device=device), device)
+    work.run()
+    work.run()
+    assert (devices.to_numpy(visits) == 2).all()
+
+
 def test_a_launch_of_more_threads_than_32_bits_count_is_refused(device):
     with pytest.raises(ArrayError, match=f"the work is {2**31} threads, a launch has at most {2**31 - 1}"):
         devices.launch(count_visits, 2**31, [1], [wp.zeros(1, dtype=int, device=device)], device=device)

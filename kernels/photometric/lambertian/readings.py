@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, new_array, pack_type
@@ -111,7 +111,7 @@ class Readings(NamedTuple):
     def on_host(self, packs: wp.array, pixel_count: int) -> np.ndarray:
         """Return values that lie as these readings do, [..., packs · lights] float packs, as [..., lights, pixels] float32. Waits for the
         device."""
-        values = packs.numpy()
+        values = to_numpy(packs)
         *rows, count, width = values.shape
         lights = self.pack_stride if self.light_stride == 1 else count // self.light_stride
         if self.light_stride == 1:

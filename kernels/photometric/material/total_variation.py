@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.grid import Walk, end_cell, first_cell, make_grid, run
 
@@ -125,4 +126,4 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     group = devices.Repeated(steps, device)
     for _ in range(GROUPS):
         group.run()
-    return np.ascontiguousarray(grid.pixels(found.numpy()))
+    return np.ascontiguousarray(grid.pixels(to_numpy(found)))

@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI, ggx, schlick
 from kernels.packs import pack_type, vector_at
@@ -91,7 +91,7 @@ def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.nda
                    [planes, wp.array(places, dtype=wp.vec4, device=device), wp.array(first, dtype=wp.int32, device=device),
                     wp.array(light[order], dtype=wp.int32, device=device),
                     wp.array(share[order], dtype=wp.float32, device=device), light_count], [table], device=device)
-    flat = table.numpy().reshape(packs, light_count, COLUMNS, lanes).transpose(0, 3, 1, 2)
+    flat = to_numpy(table).reshape(packs, light_count, COLUMNS, lanes).transpose(0, 3, 1, 2)
     return wp.array(flat.reshape(GRID * GRID, light_count, COLUMNS), dtype=wp.float32, device=device)
 
 
@@ -99,7 +99,7 @@ def search_table(table: wp.array, f0: float, widths: tuple[int, ...] = SEARCH_WI
     """Return the lobes of the search, specular ones of reflectance f0 at normal incidence; waits for the device.
     `table`: of response_table. `widths`: indices in WIDTHS of the GGX lobes. Returns [GRID², lights, 2 + widths] float32: π times the
     diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX lobes."""
-    values = table.numpy()
+    values = to_numpy(table)
     kept = np.array([0, *(1 + j for j in widths)])
     specular = SPECULAR_SCALE / f0 * (f0 * values[..., 1 + 2 * kept] + values[..., 2 + 2 * kept])
     return wp.array(np.concatenate([math.pi * values[..., :1], specular], axis=-1), dtype=wp.float32, device=table.device)

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_pixels, pack_type
 from kernels.photometric.lambertian.near import NearField, falloff, near_direction
@@ -168,7 +168,7 @@ def scratch_memory(samples: Samples, held: int) -> Any:
 
 def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
     """Return [k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
-    values = packs.numpy()
+    values = to_numpy(packs)
     flat = values.reshape(*values.shape[:-2], -1) if values.ndim > 1 else values
     flat = flat.reshape(-1, samples.packs * samples.lanes)[:, : samples.pixel_count]
     return flat[0] if packs.ndim == 1 else flat.T
@@ -176,7 +176,7 @@ def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
 
 def host_values(samples: Samples, packs: wp.array) -> np.ndarray:
     """Return [packs · lights] packs on the device as [n, lights] host values; waits for the device."""
-    values = packs.numpy()
+    values = to_numpy(packs)
     if samples.light_stride == 1:
         flat = values.reshape(samples.packs, samples.light_count, samples.lanes).transpose(0, 2, 1)
     else:
@@ -194,7 +194,7 @@ def device_values(samples: Samples, values: np.ndarray) -> wp.array:
 
 def readings_of(samples: Samples) -> np.ndarray:
     """Return [n, lights] grey readings radiance over irradiance; below 0 where there is none; waits for the device."""
-    values, level = samples.grey.numpy().reshape(_planes(samples)), samples.level.numpy()
+    values, level = to_numpy(samples.grey).reshape(_planes(samples)), to_numpy(samples.level)
     scaled = values * level[:, None] if samples.light_stride == 1 else values * level
     pixels_last = scaled.transpose(1, 0, 2) if samples.light_stride == 1 else scaled
     return pixels_last.reshape(samples.light_count, -1).T[: samples.pixel_count]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.photometric.model.candidates import LEAST_NZ
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.response_table import nodes
@@ -94,7 +94,7 @@ class Noise(NamedTuple):
 
 def bounded(table: wp.array, samples: Samples) -> Model:
     """Return the lobes of a table, bounded so that none reads more than BRIGHTER times what the object shows of a source."""
-    facing = table.numpy()[: len(nodes())][nodes()[:, 2] > math.sqrt(0.5)]  # without the Fresnel rise of the rim
+    facing = to_numpy(table)[: len(nodes())][nodes()[:, 2] > math.sqrt(0.5)]  # without the Fresnel rise of the rim
     peak = facing.max(axis=0)
     met = peak >= np.median(peak, axis=0)  # a source behind the rim is met by no lobe
     read = np.percentile(readings_of(samples), 99.5, axis=0)[:, None]

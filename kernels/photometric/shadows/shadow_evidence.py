@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.microfacet import ggx, schlick
 
@@ -101,4 +102,4 @@ def shadow_odds(readings: np.ndarray, toward: np.ndarray, normal: np.ndarray, vi
     vectors = [wp.array(np.ascontiguousarray(a, dtype=np.float32), dtype=wp.vec3, device=device) for a in (toward, normal, view, material)]
     given = wp.array(np.ascontiguousarray(readings, dtype=np.float32), dtype=float, device=device)
     devices.launch(_weigh, count, [given, *vectors], [odds], device=device)
-    return odds.numpy()
+    return to_numpy(odds)

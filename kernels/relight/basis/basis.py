@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, zeros
@@ -65,7 +65,7 @@ def gram(band: Band, keep: np.ndarray) -> np.ndarray:
     on_device = wp.array(counted, dtype=wp.float32, device=device)
     devices.launch(gram_kernel(pack), chunks * 3 * len(rows), [band.values, as_packs(on_device, device), tiles, chunks], [partial],
                    device=device)
-    lower = np.tril(partial.numpy().sum(axis=0))
+    lower = np.tril(to_numpy(partial).sum(axis=0))
     return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, as_packs, new_array, pack_type, zeros
@@ -102,7 +102,7 @@ def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
     if device != "cpu":
         return sum_rows(rows, upload_weights(weights, device))[:count]
     frames = wp.empty((count, channels, rows.shape[1] * pack), dtype=wp.float32, device=device)
-    planes, sums = rows.numpy().reshape(channels, terms, -1), frames.numpy()
+    planes, sums = to_numpy(rows).reshape(channels, terms, -1), to_numpy(frames)
     padded = _padded(weights, GROUP)
     for channel in range(channels):
         for first in range(0, count, GROUP):

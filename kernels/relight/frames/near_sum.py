@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.relight.directions.latlong import first_of_equals
@@ -55,7 +55,7 @@ def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -
     pixels = surface.packs * devices.pack_width(device)
     weights = wp.zeros((3 * count, pixels), dtype=wp.float32, device=device)
 
-    position = wp.array(surface.values.numpy()[12:15].reshape(3, -1), dtype=wp.float32, device=device)
+    position = wp.array(to_numpy(surface.values)[12:15].reshape(3, -1), dtype=wp.float32, device=device)
     wanted = [wp.array(values, dtype=dtype, device=device) for values, dtype in (
         (sources.place, wp.vec4), (sources.energy, wp.vec3), (sources.axis, wp.vec4))]
     devices.launch(_weights_kernel, pixels, [position, *wanted, _net(triangles, direction, device), count], [weights], device=device)

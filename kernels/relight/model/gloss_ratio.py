@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import channels_type, pack_type
@@ -62,7 +62,7 @@ def sum_shown(captured: Captured, energy: np.ndarray) -> ShownModel:
     used = np.flatnonzero(np.abs(energy).max(axis=1, initial=0) > 0).astype(np.int32)
     sums = captured.sums(_sum_kernel, 6, wp.array(energy, dtype=wp.vec3, device=surface.device),
                          wp.array(used, dtype=wp.int32, device=surface.device))
-    whole, ratio = sums.numpy()[:, : surface.pixel_count].reshape(2, 3, -1)
+    whole, ratio = to_numpy(sums)[:, : surface.pixel_count].reshape(2, 3, -1)
     return ShownModel(whole, ratio)
 
 

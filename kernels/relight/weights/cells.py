@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import once
+from kernels.device import once, to_numpy
 from kernels.packs import pack_type
 from kernels.relight.directions.latlong import SampleGrid, check, first_of_equals
 from kernels.relight.weights.borders import LatLongSamples, Shares, divide, reach
@@ -75,7 +75,7 @@ def nearest_light(grid: SampleGrid, directions: np.ndarray, *, device: str) -> N
     marked = wp.empty((rows, packs), dtype=pack_type(pack, wp.int32), device=device)
     devices.launch(_nearest_kernel(pack), rows * packs, [wp.array(on_rows, dtype=wp.vec3, device=device), east, north, lights],
                    [marked], device=device)
-    found = marked.numpy().reshape(rows, -1)[:, :cols]
+    found = to_numpy(marked).reshape(rows, -1)[:, :cols]
     crossed = found < 0
     return Nearest(np.where(crossed, ~found, found), crossed)
 

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.relight.directions.latlong import SampleGrid
 
 RUN = 64
@@ -68,8 +69,8 @@ def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *
               wp.array(inward, dtype=wp.vec3, device=device), wp.array(triangles.neighbour.reshape(-1), dtype=wp.int32, device=device),
               runs]
     devices.launch(_walk_kernel, rows * runs, inputs, [face, depth], device=device)
-    found = face.numpy().reshape(-1)
-    share = np.maximum(depth.numpy().reshape(-1, 3), 0) * length[found]
+    found = to_numpy(face).reshape(-1)
+    share = np.maximum(to_numpy(depth).reshape(-1, 3), 0) * length[found]
     return Located(found, share / share.sum(axis=1, keepdims=True))
 
 

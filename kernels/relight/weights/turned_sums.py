@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.relight.directions.latlong import SampleGrid, Turn, cut, shared_turns
 from kernels.relight.weights.borders import Shares
 
@@ -74,7 +75,7 @@ def _sums(amounts: wp.array, parts: _Parts, turn: Turn) -> np.ndarray:
     inputs = [wp.array(values, dtype=kind, device=HOST)
               for values, kind in zip(parts, (wp.int32, wp.int32, wp.int32, wp.float64), strict=True)]
     devices.launch(_sum_kernel, len(energy), [amounts, *inputs, shift], [energy], device=HOST, uneven=True)
-    return energy.numpy().swapaxes(0, 1)
+    return to_numpy(energy).swapaxes(0, 1)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.tof.histogram.likelihood import (
     Recorded,
     Shape,
@@ -42,7 +43,7 @@ def misfit(histograms: LiveCounts, pulse: Pulse, found: Returns) -> np.ndarray:
     result = wp.zeros(found.photons.shape, dtype=wp.float32, device=device)
     devices.launch(_misfit_kernel, histograms.counts.shape[1], [recorded(histograms), shape(pulse, device), found.position, found.photons,
                                                                 found.background], [result], device=device, uneven=True)
-    return np.asarray(result.numpy())
+    return np.asarray(to_numpy(result))
 
 
 @wp.kernel(module="unique", module_options={"max_unroll": 0})  # unrolled, it is no faster and takes seconds to compile

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.tof.histogram.pileup import LiveCounts
 from kernels.tof.histogram.pulse import Pulse, gaussian, with_tail
@@ -88,9 +89,9 @@ def brightest(counts: np.ndarray) -> np.ndarray:
 def _evidence(some: LiveCounts, pulse: Pulse) -> float:
     """Return the log likelihood of histograms under a pulse, less the price of their returns; -inf where there is none."""
     found = find_returns(some, pulse, most=WIDTH_RETURNS)
-    sigma = found.sigma.numpy()[found.photons.numpy() > 0].astype(np.float64)
+    sigma = to_numpy(found.sigma)[to_numpy(found.photons) > 0].astype(np.float64)
     cost = len(sigma) * 0.5 * threshold(some.counts.shape[0]) - np.log((2 * np.pi) ** 0.5 * np.maximum(sigma, LEAST_SIGMA)).sum()
-    return float(found.likelihood.numpy().sum(dtype=np.float64) - cost) if len(sigma) else -np.inf
+    return float(to_numpy(found.likelihood).sum(dtype=np.float64) - cost) if len(sigma) else -np.inf
 
 
 def _tailed(evidence: Callable[[Pulse], float], sigma: float, *, longest: float) -> PulseShape:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.tof.histogram.likelihood import Recorded, Shape, likelihood_gain, recorded, shape
 from kernels.tof.histogram.pileup import LiveCounts
 from kernels.tof.histogram.pulse import Pulse
@@ -62,23 +63,23 @@ def vote_on_returns(histograms: LiveCounts, pulse: Pulse, found: Returns, rows: 
     """
     device = str(histograms.counts.device)
     pixels = histograms.counts.shape[1]
-    position, sigma, photons, confidence = (array.numpy()[0].copy() for array in (found.position, found.sigma, found.photons,
+    position, sigma, photons, confidence = (to_numpy(array)[0].copy() for array in (found.position, found.sigma, found.photons,
                                                                                   found.confidence))
     times, spread, likely, strength = (np.zeros((RIVALS, pixels), dtype=np.float32) for _ in range(4))
     times[0], spread[0], likely[0], strength[0] = position, sigma, confidence, photons
     elsewhere, none = np.zeros(pixels, dtype=np.float32), np.where(confidence > 0, 1 - confidence, 0).astype(np.float32)
-    open_ones = np.nonzero(usable & (confidence < SURE) & (found.background.numpy() > 0))[0]
+    open_ones = np.nonzero(usable & (confidence < SURE) & (to_numpy(found.background) > 0))[0]
     likely[:, ~usable], none[~usable] = 0, 0
     if len(open_ones) == 0:
         return Voted(position, sigma, photons, confidence, np.zeros(pixels, dtype=bool), none)
     some = histograms.of(open_ones)
-    background = wp.array(found.background.numpy()[open_ones], dtype=wp.float32, device=device)
+    background = wp.array(to_numpy(found.background)[open_ones], dtype=wp.float32, device=device)
     outputs = [*(wp.zeros((RIVALS, len(open_ones)), dtype=wp.float32, device=device) for _ in range(4)),
                *(wp.zeros(len(open_ones), dtype=wp.float32, device=device) for _ in range(2))]
     devices.launch(_rivals_kernel, len(open_ones), [recorded(some), shape(pulse, device), positions_per_bin(pulse), first_bin, last_bin,
                                                     background], outputs, device=device, uneven=True)
-    times[:, open_ones], strength[:, open_ones], spread[:, open_ones], likely[:, open_ones] = (array.numpy() for array in outputs[:4])
-    elsewhere[open_ones], none[open_ones] = (array.numpy() for array in outputs[4:])
+    times[:, open_ones], strength[:, open_ones], spread[:, open_ones], likely[:, open_ones] = (to_numpy(array) for array in outputs[:4])
+    elsewhere[open_ones], none[open_ones] = (to_numpy(array) for array in outputs[4:])
     after, none[open_ones] = _vote(times, spread, strength, likely, elsewhere, none, rows, cols, open_ones, span=last_bin - first_bin,
                                    slope=SLOPE_WIDTHS * max(pulse.width, 1.0), device=device)
     best = np.argmax(after, axis=0)
@@ -90,7 +91,7 @@ def vote_on_returns(histograms: LiveCounts, pulse: Pulse, found: Returns, rows: 
     kept = before & (np.abs(times[best, open_ones] - position[open_ones]) < pulse.width)  # with the other returns taken into account
     new = open_ones[there & ~kept]
     taken = there & ~kept
-    position[new], sigma[new] = exact.position.numpy()[0][taken], exact.sigma.numpy()[0][taken]
+    position[new], sigma[new] = to_numpy(exact.position)[0][taken], to_numpy(exact.sigma)[0][taken]
     photons[new] = strength[best, open_ones][taken]
     confidence[open_ones] = np.where(there, after[best, chosen], 0)
     weak = np.zeros(pixels, dtype=bool)
@@ -112,7 +113,7 @@ def _vote(times: np.ndarray, spread: np.ndarray, strength: np.ndarray, likely: n
                                                       before_none, rows, cols, span, slope], [after, after_elsewhere, after_none],
                        device=device)
         before, before_elsewhere, before_none = after, after_elsewhere, after_none
-    return before.numpy()[:, open_ones], before_none.numpy()[open_ones]
+    return to_numpy(before)[:, open_ones], to_numpy(before_none)[open_ones]
 
 
 @wp.func

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.tof.histogram.pileup import LiveCounts, correct_pileup, without_pileup
 from kernels.tof.histogram.pulse import Pulse
 from kernels.tof.histogram.returns import Returns, find_returns
@@ -149,7 +150,7 @@ class _Counted:
         """Return the log probability of all histograms at their best returns, less a part that does not depend on the pulses."""
         histograms = without_pileup(self.placed) if pulses is None else correct_pileup(self.placed, pulses=pulses)
         found = find_returns(histograms, pulse, most=RETURNS)
-        value = float(found.likelihood.numpy().sum(dtype=np.float64))  # above that of one photon a bin
+        value = float(to_numpy(found.likelihood).sum(dtype=np.float64))  # above that of one photon a bin
         if pulses is None:
             return value - self.counts.size, found
         left = pulses - (np.cumsum(self.counts, axis=1) - self.counts)
@@ -174,8 +175,8 @@ def _expected(found: Returns, pulse: Pulse, bins: int) -> np.ndarray:
     """Return the photons a bin of the background and the returns that were found, [pixel, bin]."""
     edges = np.arange(bins + 1)
     times = pulse.begin + pulse.step * np.arange(len(pulse.cumulative))
-    mean = np.repeat(found.background.numpy()[:, None].astype(np.float64), bins, axis=1)
-    for position, photons in zip(found.position.numpy(), found.photons.numpy(), strict=True):
+    mean = np.repeat(to_numpy(found.background)[:, None].astype(np.float64), bins, axis=1)
+    for position, photons in zip(to_numpy(found.position), to_numpy(found.photons), strict=True):
         mean += photons[:, None] * np.diff(np.interp(edges - position[:, None], times, pulse.cumulative), axis=1)
     return mean
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from kernels.device import to_numpy
 from service.cli.commands.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
@@ -53,7 +54,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
-            sound = bool((combine(band, np.full((3, 8), 0.25, dtype=np.float32)).numpy() == 2.0).all())
+            sound = bool((to_numpy(combine(band, np.full((3, 8), 0.25, dtype=np.float32))) == 2.0).all())
             print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")
             if name != "cpu":
                 print(f"{'cuBLAS':<12} {name}: {cublas.describe(name)}")
@@ -113,7 +114,7 @@ def _wrong_products(device: str) -> list[str]:
     rng = np.random.default_rng(0)
     band = packs.upload(rng.random((3, 16, 256)).astype(np.float16), device=device)
     weights = rng.random((40, 3, 16), dtype=np.float32)
-    theirs, ours = (combine_batch(band, weights, with_cublas=which).numpy() for which in (True, False))
+    theirs, ours = (to_numpy(combine_batch(band, weights, with_cublas=which)) for which in (True, False))
     agree = np.allclose(theirs, ours, rtol=cublas.TOLERANCE, atol=0)
     return [] if agree else [f"{device}: cuBLAS gives wrong sums: uninstall nvmath-python"]
 

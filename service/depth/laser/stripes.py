@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.status import Status
 from kernels.structured.stripe import REACH, find_stripe, plane_depths
 from service.depth.laser.stripe_curves import PEAKS, Chosen, choose_curves
@@ -199,7 +200,7 @@ def _peaks(signal: Signal, along: str, sweep: Sweep, device: str) -> tuple[np.nd
     rows: list[tuple[np.ndarray, ...]] = []
     for _ in range(PEAKS):
         found = find_stripe(left, along=along, noise=signal.noise, device=device, albedo=sweep.albedo_for(signal), rival=np.inf)
-        centre, sigma, uneven, width, level, even, amplitude, status = (array.numpy() for array in found)
+        centre, sigma, uneven, width, level, even, amplitude, status = (to_numpy(array) for array in found)
         rows.append((centre, _deviation(centre, sigma, uneven, width, level, even, status, signal.noise), level, amplitude, status))
         if not (status == Status.OK).any():
             break

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.status import SOLVED, Status
 from kernels.structured.opaque_surface import check_surface
 from service.depth.base.solution import DepthSolution
@@ -60,11 +61,11 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
         x, y = camera.plane_coordinates()
         found = check_surface(solution.depth, solution.sigma, solution.amplitude, solved, x, y, projector.projector_from_camera(),
                               device=device)
-        wrong = ((found.turned.numpy() | found.alone.numpy() | found.contradicted.numpy()) > 0).reshape(right.shape) & solved
+        wrong = ((to_numpy(found.turned) | to_numpy(found.alone) | to_numpy(found.contradicted)) > 0).reshape(right.shape) & solved
         right[wrong] = DOUBTED
-        solution.sigma[solved] = np.hypot(solution.sigma, found.deviation.numpy().reshape(right.shape))[solved]
-        solution.facts["doubted"] = {"facing_away": int(found.turned.numpy().sum()), "alone": int(found.alone.numpy().sum()),
-                                     "lit_twice": int(found.contradicted.numpy().sum())}
+        solution.sigma[solved] = np.hypot(solution.sigma, to_numpy(found.deviation).reshape(right.shape))[solved]
+        solution.facts["doubted"] = {"facing_away": int(to_numpy(found.turned).sum()), "alone": int(to_numpy(found.alone).sum()),
+                                     "lit_twice": int(to_numpy(found.contradicted).sum())}
     if residual_px is not None and solved.sum() >= ENOUGH:
         usual = max(float(np.median(residual_px[solved])), LEAST_RESIDUAL_PX / RESIDUAL_TIMES)
         right[solved & (residual_px > RESIDUAL_TIMES * usual)] = DOUBTED

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from service.depth.base.solution import PixelSolution, statistics
@@ -64,12 +65,12 @@ class Coordinates:
         for axis, found in zip((self.columns, self.rows), decoded, strict=True):
             if axis is None or found is None:
                 continue
-            coordinate, sigma, _, status = (array.numpy()[:mask.size].reshape(shape) for array in found)
+            coordinate, sigma, _, status = (to_numpy(array)[:mask.size].reshape(shape) for array in found)
             kept = mask & np.isin(status, ESTIMATED) & (sigma > 0)
             axis.coordinate[band] = np.where(kept, coordinate, 0)
             axis.sigma[band] = np.where(kept, sigma, 0)
             axis.status[band] = np.where(mask, status, int(Status.UNSOLVED))
-        swings = [found.amplitude.numpy()[:mask.size].reshape(shape) for found in decoded if found is not None]
+        swings = [to_numpy(found.amplitude)[:mask.size].reshape(shape) for found in decoded if found is not None]
         self.amplitude[band] = np.where(mask, np.minimum.reduce(swings), 0)
 
     def status(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.errors import KernelError
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
@@ -135,7 +136,7 @@ def agreeing_share(sample: Sample, patterns: list[Pattern], projector: PatternPr
         decoded = [None if axis is None else _mirror(axis, extent, device) for axis, extent in zip(decoded, model.size, strict=True)]
     found = triangulate(sample.x.ravel(), sample.y.ravel(), decoded[0], decoded[1], model, near_m=0.0, far_m=np.inf, max_residual_px=4.0,
                         device=device)
-    depth, sigma, status = (array.numpy()[:sample.mask.size].reshape(shape) for array in (found.depth, found.sigma, found.status))
+    depth, sigma, status = (to_numpy(array)[:sample.mask.size].reshape(shape) for array in (found.depth, found.sigma, found.status))
     lit = sample.mask & ~np.isin(status, NOT_LIT)
     pairs = lit[:, 1:] & lit[:, :-1]
     if pairs.sum() < ENOUGH:
@@ -152,7 +153,7 @@ def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, devic
 
 
 def _mirror(axis: Decoded, extent: float, device: str) -> Decoded:
-    return axis._replace(coordinate=type(axis.coordinate)(extent - axis.coordinate.numpy(), device=device))
+    return axis._replace(coordinate=type(axis.coordinate)(extent - to_numpy(axis.coordinate), device=device))
 
 
 def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], bool], float]) -> Iterator[tuple[float, Reading]]:
@@ -213,7 +214,7 @@ def unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjec
         if decoder is None:
             continue
         decoded = decode_sample(sample, decoder, noise, device)
-        u, status = (array.numpy()[:sample.mask.size].reshape(sample.mask.shape) for array in (decoded.coordinate, decoded.status))
+        u, status = (to_numpy(array)[:sample.mask.size].reshape(sample.mask.shape) for array in (decoded.coordinate, decoded.status))
         sure = (status == OK)[:, 1:] & (status == OK)[:, :-1]
         pairs = sample.mask[:, 1:] & sample.mask[:, :-1]
         step = np.where(sure, np.minimum(np.abs(np.diff(u, axis=1)) / extent, LARGEST_STEP), LARGEST_STEP)[pairs]
@@ -280,7 +281,7 @@ def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, proj
             decoded = decode_sample(sample, decoder, noise, device)
         except KernelError:  # two places look alike under this response
             continue
-        u, status = (array.numpy()[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
+        u, status = (to_numpy(array)[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
         keep = (status == OK) & sample.mask.ravel()
         if keep.sum() < ENOUGH:
             continue

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded, cropped
 from kernels.structured.pattern_frames import NoiseModel
@@ -252,12 +253,12 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                             device=device)
         part = mask[band]
         coordinates.put(band, part, decoded)
-        code = found.status.numpy()[:part.size].reshape(part.shape)
+        code = to_numpy(found.status)[:part.size].reshape(part.shape)
         status[band] = np.where(part, code, int(Status.UNSOLVED))
         solved = np.isin(status[band], SOLVED)
-        kept = solved | (np.isin(status[band], ESTIMATED) & (found.depth.numpy()[:part.size].reshape(part.shape) > 0))
+        kept = solved | (np.isin(status[band], ESTIMATED) & (to_numpy(found.depth)[:part.size].reshape(part.shape) > 0))
         for name in maps:
-            maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
+            maps[name][band] = np.where(kept, to_numpy(getattr(found, name))[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
     lagging: list[str] = []
     if declared:

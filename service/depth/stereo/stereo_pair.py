@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.status import Status
 from kernels.stereo.choice import choose
 from kernels.stereo.cost import Labels, matching_cost
@@ -123,7 +124,7 @@ def unique_places(images: RectifiedFrames, device: str) -> Places:
         part = slice(first, min(first + band, rows))
         places = probe(images.left[:PROBE_FRAMES, part], images.right[:PROBE_FRAMES, part], images.right_seen[part], labels, step=step,
                        device=device)
-        label, lead = places.label.numpy(), places.lead.numpy()
+        label, lead = to_numpy(places.label), to_numpy(places.lead)
         down, across = (np.minimum(np.arange(size) * step + step // 2, most) for size, most in
                         zip(label.shape, (part.stop - part.start - 1, cols - 1), strict=True))
         seen = images.left_seen[part][np.ix_(down, across)]
@@ -175,10 +176,10 @@ def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: Noi
     volume = matching_cost(left, right, right_seen, labels, device=device)
     choice = choose(volume, gather(volume), labels, right_columns=right.shape[2])
     del volume
-    label, fraction, disagreement, _, lead = (array.numpy() for array in choice)
+    label, fraction, disagreement, _, lead = (to_numpy(array) for array in choice)
     start = (labels.highest - label - fraction).astype(np.float32)
     fine = refine(left, right, start, device=device)
-    disparity, slope_x, slope_y, sigma, misfit, centre, _ = (array.numpy() for array in fine)
+    disparity, slope_x, slope_y, sigma, misfit, centre, _ = (to_numpy(array) for array in fine)
     found = sigma > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = sigma / misfit * np.hypot(NOISE_FACTOR * misfit, ALIAS_FACTOR)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.packs import padded_count
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
@@ -95,7 +96,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
     found_depth = triangulate(x.ravel().astype(np.float32), y.ravel().astype(np.float32), u, v, projector_model(seen_by),
                               near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px,
                               device=device)
-    depth, sigma, residual, code = (array.numpy()[:mask.size].reshape(mask.shape) for array in found_depth)
+    depth, sigma, residual, code = (to_numpy(array)[:mask.size].reshape(mask.shape) for array in found_depth)
     status = np.where(status == Status.OCCLUDED, status, code).astype(np.uint8)
     kept = np.isin(status, ESTIMATED) & (depth > 0)
     status[~mask] = int(Status.UNSOLVED)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.tof.continuous.continuous import ENTRIES, LEAST_PHASES, Correlation, Noise, decode, sample_harmonics, straighten, weights
@@ -166,7 +167,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     reach = np.zeros(rows * cols, dtype=np.int32)
     if options.vote:
         found, pooled = pool(found, rows, cols, light_speed=SPEED_OF_LIGHT)
-        reach = pooled.numpy()[:rows * cols]
+        reach = to_numpy(pooled)[:rows * cols]
     straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
     agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
 
@@ -178,32 +179,32 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
 
     pixels = rows * cols
     ranges = ranges_of(found)
-    status = first_status = ranges.status.numpy()[:pixels]
+    status = first_status = to_numpy(ranges.status)[:pixels]
     widened = widen(found, ranges, rows, cols, light_speed=SPEED_OF_LIGHT)
-    further = widened.further.numpy()[:pixels]
+    further = to_numpy(widened.further)[:pixels]
     if further.any():
         ranges = ranges_of(widened.found)
-        again = ranges.status.numpy()[:pixels]
+        again = to_numpy(ranges.status)[:pixels]
         status = np.where((status == Status.MULTIPATH) & (again == Status.OK), status, again)
     spacing_m = common_range_m(frames.modulation_hz.max(), SPEED_OF_LIGHT)
-    sigma = cover_steps(ranges, found.amplitude, rows, cols, spacing_m=spacing_m).numpy()[:pixels]
-    confidence = ranges.confidence.numpy()[:pixels] * np.where(reach > 0, POOLED, 1).astype(np.float32)
+    sigma = to_numpy(cover_steps(ranges, found.amplitude, rows, cols, spacing_m=spacing_m))[:pixels]
+    confidence = to_numpy(ranges.confidence)[:pixels] * np.where(reach > 0, POOLED, 1).astype(np.float32)
     lit = usable.reshape(-1) & ~np.isin(first_status, NO_SIGNAL)
     declared = float(((first_status == Status.OK) & (further == 0))[lit].mean()) if lit.any() else 1.0
 
     def agreeing(other: Phases) -> float:
         phases = _with_phases(found, other)
         first = ranges_of(phases, min(farthest, nearest + common_range_m(other.hz, SPEED_OF_LIGHT)))
-        more = widen(phases, first, rows, cols, light_speed=SPEED_OF_LIGHT).further.numpy()[:pixels]
-        return float(((first.status.numpy()[:pixels] == Status.OK) & (more == 0))[lit].mean())
+        more = to_numpy(widen(phases, first, rows, cols, light_speed=SPEED_OF_LIGHT).further)[:pixels]
+        return float(((to_numpy(first.status)[:pixels] == Status.OK) & (more == 0))[lit].mean())
 
-    phase, spread = (array.numpy()[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
+    phase, spread = (to_numpy(array)[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
     size_rad = np.inf
     wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing) if lit.any() else None
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
     if wrong is None:
-        wrong = misread_direction(ranges.range.numpy()[:pixels].reshape(rows, cols),
-                                  found.amplitude.numpy()[-1, :pixels].reshape(rows, cols), sure, nearest_m=nearest,
+        wrong = misread_direction(to_numpy(ranges.range)[:pixels].reshape(rows, cols),
+                                  to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols), sure, nearest_m=nearest,
                                   repeat_m=common_range_m(frames.modulation_hz, SPEED_OF_LIGHT))
     if wrong is None:
         size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
@@ -220,8 +221,8 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         "agreement_rad": agreement,
         "with_neighbours": int((usable.reshape(-1) & (reach > 0) & np.isin(status, ESTIMATED)).sum()),
     }
-    return RangeImage("time of flight, continuous wave", ranges.range.numpy()[:pixels], sigma,
-                    found.amplitude.numpy()[:, :pixels].mean(axis=0), confidence, status, facts, DECIDED,
+    return RangeImage("time of flight, continuous wave", to_numpy(ranges.range)[:pixels], sigma,
+                    to_numpy(found.amplitude)[:, :pixels].mean(axis=0), confidence, status, facts, DECIDED,
                     () if wrong is None else (wrong,))
 
 
@@ -229,7 +230,7 @@ def _with_phases(found: Correlation, other: Phases) -> Correlation:
     """Return the phases of a whole image as `unwrap` takes them: under other frequencies, or running the other way."""
     arrays = []
     for before, after in ((found.phase, other.phase), (found.sigma, other.sigma)):
-        values = before.numpy().copy()
+        values = to_numpy(before).copy()
         values[:, :after[0].size] = after.reshape(len(after), -1)
         arrays.append(wp.array(values, dtype=wp.float32, device=str(before.device)))
     return found._replace(phase=arrays[0], sigma=arrays[1], modulation_hz=other.hz)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.status import SOLVED, Status
 from kernels.tof.histogram.misfit import misfit
 from kernels.tof.histogram.pileup import LiveCounts, checked, correct_pileup, place, without_pileup
@@ -77,7 +78,7 @@ def pattern_bins(counts: np.ndarray) -> np.ndarray:
 def without_bins(histograms: LiveCounts, bins: np.ndarray) -> LiveCounts:
     """Return histograms in which these bins, [bin] bool, count as never open; waits for the device."""
     device = str(histograms.counts.device)
-    kept = [np.where(bins[:, None], 0, array.numpy()) for array in (histograms.counts, histograms.live)]
+    kept = [np.where(bins[:, None], 0, to_numpy(array)) for array in (histograms.counts, histograms.live)]
     return LiveCounts(*(wp.array(values, dtype=wp.float32, device=device) for values in kept), histograms.pulses)
 
 
@@ -182,15 +183,15 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     pulse, source, zero_bins = _zero_of(shape, frames, calibration, warnings)
     found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=first_bin, last_bin=last_bin)
     chosen = _choose(found, options.which, None if fog is None else np.stack([
-        fog.stands_out(photons_of, found.background.numpy(), place, pulse.width) for place in found.position.numpy()]))
+        fog.stands_out(photons_of, to_numpy(found.background), place, pulse.width) for place in to_numpy(found.position)]))
 
     def of(values: np.ndarray) -> np.ndarray:
         return np.asarray(np.take_along_axis(values, chosen[None], axis=0)[0])
 
     dispersion = of(misfit(histograms, pulse, found))
-    position, sigma, photons, confidence = (of(array.numpy()) for array in (found.position, found.sigma, found.photons, found.confidence))
+    position, sigma, photons, confidence = (of(to_numpy(array)) for array in (found.position, found.sigma, found.photons, found.confidence))
     sigma = sigma * np.sqrt(dispersion)
-    status = found.status.numpy()
+    status = to_numpy(found.status)
     weak = 0
     if options.vote:
         voted = vote_on_returns(histograms, pulse, found, rows, cols, usable=usable, first_bin=first_bin, last_bin=last_bin)
@@ -204,7 +205,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         sigma = np.hypot(sigma, _doubt(photons_of, pile_up, pulse, position, device))
     if fog is not None:
         sigma = np.hypot(sigma, fog.shift(position, photons, pulse.width))
-        outside = fog.stands_out(photons_of, found.background.numpy(), position, pulse.width)
+        outside = fog.stands_out(photons_of, to_numpy(found.background), position, pulse.width)
         confidence = np.where(outside, confidence, np.minimum(confidence, IN_TURN))
     if limit is not None:
         status = np.where((frames.counts >= limit).any(axis=1), int(Status.SATURATED), status)
@@ -219,7 +220,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         warnings.append(f"frames[].tof: the pulse does not describe the returns of {100 * bent:.0f} % of the pixels, which differ from "
                         "it by more than photon noise: measure the pulse and give it in --tof-calibration; the standard deviations hold "
                         "the scatter that this makes, not a shift that all of them share, as by fog")
-    several = (found.photons.numpy() > 0).sum(axis=0)
+    several = (to_numpy(found.photons) > 0).sum(axis=0)
     facts: dict[str, Any] = {
         "bins": frames.counts.shape[1],
         "bin_s": frames.bin_s,
@@ -232,7 +233,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         "return": str(options.which),
         "returns_found": {str(n): int((several[usable] == n).sum()) for n in range(1, MOST_RETURNS + 1)},
         "chosen_by_neighbours": weak,
-        "background_photons_a_bin": float(np.median(found.background.numpy()[usable])),
+        "background_photons_a_bin": float(np.median(to_numpy(found.background)[usable])),
     }
     return RangeImage("time of flight, pulsed", (start_m + position * bin_m).astype(np.float32),
                       (np.hypot(sigma, zero_bins) * bin_m).astype(np.float32), photons.astype(np.float32),
@@ -306,7 +307,7 @@ def _doubt(photons: np.ndarray, pile_up: PulseCount, pulse: Pulse, position: np.
     """Return by how many bins each position moves with the number of pulses, which was estimated, by a standard deviation."""
     more = max(math.ceil(pile_up.pulses * math.exp(pile_up.relative)), pile_up.pulses + 1)
     other = find_returns(correct_pileup(place(photons, device), pulses=more), pulse)
-    moved = np.abs(other.position.numpy()[0] - position)
+    moved = np.abs(to_numpy(other.position)[0] - position)
     return np.where(moved < pulse.width, moved, 0)
 
 
@@ -333,7 +334,7 @@ def _zero_of(shape: PulseShape, frames: Histograms, calibration: TofCalibration,
 
 def _choose(found: Returns, which: WhichReturn, surface: np.ndarray | None = None) -> np.ndarray:
     """Return the index of the return to take, [pixel]; 0 where there is none. `surface`: which of them may be one, [return, pixel]."""
-    position, there = found.position.numpy(), found.photons.numpy() > 0
+    position, there = to_numpy(found.position), to_numpy(found.photons) > 0
     if surface is not None:
         there &= surface
     if which is WhichReturn.FIRST:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.status import ESTIMATED, Status, refuse_unsure
 from kernels.tof.continuous.bilateral import smooth
 from kernels.tof.continuous.flying import mark_flying
@@ -149,4 +150,4 @@ def _filter(range_m: np.ndarray, sigma: np.ndarray, guide: np.ndarray, status: n
     if TofFilter.BILATERAL in filters:
         picture = wp.array(np.ascontiguousarray(guide, dtype=np.float32), device=device)
         ranges, deviations = smooth(ranges, deviations, picture, codes, rows, cols)
-    return ranges.numpy(), deviations.numpy(), codes.numpy()
+    return to_numpy(ranges), to_numpy(deviations), to_numpy(codes)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import to_numpy
 from kernels.fusion.bricks import MEMORY_BOUND
 from kernels.fusion.gather import gather
 from kernels.fusion.rasterise import rasterise
@@ -284,7 +285,7 @@ def _gathered(points: np.ndarray, normals: np.ndarray, scans: list[PreparedScan]
         shown = gather(views, layers, feathers, wp.array((points[box.chosen] - low).astype(np.float32), dtype=wp.vec3, device=device),
                        wp.array(normals[box.chosen].astype(np.float32), dtype=wp.vec3, device=device),
                        wp.zeros(len(box.chosen), dtype=float, device=device), vectors=3, slack=SLACK_VOXELS * voxel, device=device)
-        values[box.chosen], known[box.chosen] = shown.values.numpy(), shown.weight.numpy() > 0
+        values[box.chosen], known[box.chosen] = to_numpy(shown.values), to_numpy(shown.weight) > 0
         for each in box.watching:
             each.scan.release()
     return values, known

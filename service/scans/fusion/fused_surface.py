@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.fusion.bricks import BRICK_VOXELS, find_blocks
 from kernels.fusion.extract import extract
 from kernels.fusion.gather import gather
@@ -269,12 +270,12 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
     layers, feathers = upload_layers(watching, device)
     shown = gather(views, layers, feathers, *(wp.array(values, dtype=kind, device=device) for values, kind in (
         (triangles.points, wp.vec3), (of_faces, wp.vec3), (triangles.sigma, float))), vectors=3, slack=voxel, device=device)
-    values = shown.values.numpy()
+    values = to_numpy(shown.values)
     place = channels(names)[NORMAL]
     normals = values[:, place]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1), of_faces).astype(np.float32)
-    return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, shown.seen.numpy().astype(np.uint16)
+    return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, to_numpy(shown.seen).astype(np.uint16)
 
 
 def _normals_of_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels import packs
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.near import NearField, NearLights, see_near
 from kernels.photometric.lambertian.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.model.samples import Samples, gather
@@ -140,7 +141,7 @@ def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarra
 def readable(samples: Samples) -> np.ndarray:
     """Return [n] uint8 status: OK where enough frames have a reading and one of them is above zero. Waits for the device."""
     width = (samples.packs, samples.light_count) if samples.light_stride == 1 else (samples.light_count, samples.packs)
-    values = samples.grey.numpy().reshape(*width, samples.lanes)
+    values = to_numpy(samples.grey).reshape(*width, samples.lanes)
     values = values.transpose(1, 0, 2) if samples.light_stride == 1 else values
     values = values.reshape(samples.light_count, -1)[:, : samples.pixel_count]
     status = np.where((values > 0).any(axis=0), int(Status.OK), int(Status.DARK))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.images import ImagesOnDevice
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.readings import Lights, channel_weights
@@ -134,9 +135,9 @@ class Solution:
     def place(self, span: slice, inside: np.ndarray, fit: NormalFit) -> None:
         """Store the normals of a band, which have padding, at those of its pixels that are inside the mask, [n] bool."""
         count = len(inside)
-        self.normal[:, span] = np.where(inside, fit.normal.numpy()[:, :count], 0)
-        self.residual[span] = np.where(inside, fit.residual.numpy()[:count], 0)
-        self.status[span] = np.where(inside, fit.status.numpy()[:count], int(Status.UNSOLVED))
+        self.normal[:, span] = np.where(inside, to_numpy(fit.normal)[:, :count], 0)
+        self.residual[span] = np.where(inside, to_numpy(fit.residual)[:count], 0)
+        self.status[span] = np.where(inside, to_numpy(fit.status)[:count], int(Status.UNSOLVED))
 
 
 def mark_not_facing(camera: Camera, solution: Solution) -> None:

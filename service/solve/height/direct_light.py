@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import Samples
@@ -56,7 +57,7 @@ class DirectLight(NamedTuple):
             arriving = arriving._replace(light=wp.array(arriving.light, dtype=wp.float32, device=device))
         if device == self.given.device:
             return self._replace(arriving=arriving)
-        solved, height = (wp.array(plane.numpy(), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
+        solved, height = (wp.array(to_numpy(plane), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
         return self._replace(solved=solved, height=height, arriving=arriving)
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
@@ -89,9 +90,9 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         return None
     height = surface.height
     if parts and field is None and surface.part is not None:
-        placed = place_parts(given, lights, normal, material, height.numpy(), surface.part)
+        placed = place_parts(given, lights, normal, material, to_numpy(height), surface.part)
         height = wp.array(placed.height, dtype=float, device=given.device)
     arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
     mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
     on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
-    return DirectLight(given, lights, field, on_device, height, extent_of(height.numpy(), mask), shadows, arriving, bouncing)
+    return DirectLight(given, lights, field, on_device, height, extent_of(to_numpy(height), mask), shadows, arriving, bouncing)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, median_of
 from stage.capture.capture import Capture
@@ -230,9 +231,9 @@ def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
         solved = mask & ((normal * sight).sum(axis=0) > 0.05 * np.linalg.norm(sight, axis=0))
         if not solved.any():
             break
-        found = integrate_normals(normal, solved, sample.x.astype(np.float32), sample.y.astype(np.float32),
+        found = to_numpy(integrate_normals(normal, solved, sample.x.astype(np.float32), sample.y.astype(np.float32),
                                   perspective=sample.perspective, mean_z=z, options=INTEGRATION,
-                                  device=device).height.numpy()
+                                  device=device).height)
         height = np.where(solved & np.isfinite(found) & (found < sample.top), found, z)
         fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(height)[mask])
     return fit

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.readings import Lights
 from kernels.surface.interreflection import gather_light
 from service.solve.base.solution import SolveInput
@@ -83,7 +84,7 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
         sums = np.stack([np.bincount(patch, weights=plane, minlength=len(kept)) for plane in values.T], axis=1)
         return sums / count[kept][:, None]
 
-    surface = camera.points(height.numpy()).reshape(-1, 3)[pixels]
+    surface = camera.points(to_numpy(height)).reshape(-1, 3)[pixels]
     centres, facing = mean(surface), mean(normal[:, pixels].T)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
     perspective = camera.projection == "perspective"

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
@@ -168,9 +169,9 @@ class _Shadows:
         """Integrate a small map, and read some of its pixels under some of the lights."""
         rows, cols = small.mask.shape
         across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
-        self._height = integrate_normals(
+        self._height = to_numpy(integrate_normals(
             small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
-            options=IntegrationOptions(discontinuities=True), device=given.device).height.numpy()
+            options=IntegrationOptions(discontinuities=True), device=given.device).height)
         surface = np.flatnonzero(small.mask)
         self._mask, self._chosen = small.mask, surface[evenly(len(surface), SHADOW_PIXELS)]
         some = evenly(len(lights.direction), SHADOW_LIGHTS)

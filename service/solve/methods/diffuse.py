@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearField, see_near
@@ -36,9 +37,9 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
         evidence = fit.across, fit.squares, fit.freedom, fit.agreeing
-        across, squared, freedom, agreeing = (array.numpy()[: len(inside)] for array in evidence)
+        across, squared, freedom, agreeing = (to_numpy(array)[: len(inside)] for array in evidence)
         found = fit_albedo(band, readings, fit, lights, near)
-        albedo, squares, openness, steep, bounced = (array.numpy()[..., : len(inside)] for array in found)
+        albedo, squares, openness, steep, bounced = (to_numpy(array)[..., : len(inside)] for array in found)
         result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, agreeing, misfit), bounced, misfit), 0)
         result.albedo[:, span] = np.where(inside, albedo, 0)
         own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, bounced, freedom, misfit), 0)
@@ -65,15 +66,15 @@ def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = 
         toward = np.broadcast_to(lights.direction.T[:, :, None], (3, *values.shape))
     else:
         toward = readings.on_host(near.toward, len(pixels))
-    solved = (fit.status.numpy()[: len(pixels)] == Status.OK).reshape(2, -1).all(axis=0)
+    solved = (to_numpy(fit.status)[: len(pixels)] == Status.OK).reshape(2, -1).all(axis=0)
     # the fit has put its weights in place of the values
     weights = readings.on_host(readings.values, len(pixels))
 
     def pairs(array: np.ndarray) -> np.ndarray:
         return array[..., : len(pixels)].reshape(*array.shape[:-1], 2, -1)[..., solved]
 
-    return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(fit.normal.numpy()),
-                                   pairs(fit.squares.numpy()), pairs(fit.freedom.numpy())))
+    return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(to_numpy(fit.normal)),
+                                   pairs(to_numpy(fit.squares)), pairs(to_numpy(fit.freedom))))
 
 
 def pair_starts(mask: np.ndarray, most: int) -> np.ndarray:

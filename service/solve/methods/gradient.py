@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.photometric.gradient.gradient import diffuse_normals
 from kernels.photometric.gradient.highlight import fit_highlights, specular_normals
@@ -77,9 +78,9 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
         _store(length, here, kept, fit.length)
         _store(bent, here, kept, fit.bent)
         if frames.parallel is not None:
-            metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
-            result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
-        separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
+            metal[here] = _take_highlight(result, here, to_numpy(parts.specular)[:3, : len(kept)])
+            result.residual[here] = np.where(metal[here], to_numpy(parallel.residual)[: len(kept)], result.residual[here])
+        separated[here] = kept & (to_numpy(diffuse.tilt)[: len(kept)] == 0)
 
     found = (result.normal, result.albedo, result.sigma, result.residual, result.status, result.specular_normal, result.specular,
              result.roughness, bent, length, separated, metal)
@@ -132,7 +133,7 @@ def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.n
 def _store(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
     """Store the result of a band; 0 outside the mask, which as a status is UNSOLVED."""
     assert target is not None
-    target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)
+    target[..., here] = np.where(kept, to_numpy(found)[..., : len(kept)], 0)
 
 
 def _moments(band: Band, rows: np.ndarray, stack: Stack) -> Moments:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.lambert import solve_lambert
 from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
@@ -130,7 +131,8 @@ class _Walk:
             if self._few:
                 grey = grey_readings(band, grey_factors(self._lights, GREY_WEIGHTS))
                 fit = solve_lambert(band, grey, self._lights.direction, near)
-                self._lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
+                status, normal = (to_numpy(each) for each in (fit.status, fit.normal))
+                self._lambertian[:, span] = np.where(status[: len(inside)] == Status.OK, normal[:, : len(inside)],
                                                      self.result.normal[:, span])
 
         each_band(self._given, self._lights, self._field, begin,

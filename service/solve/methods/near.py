@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.near import NearField, pad_places
 from kernels.photometric.lambertian.readings import Lights, pad_lights
 from kernels.status import Status
@@ -74,7 +75,7 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
             rounds[str(method)] = number
             if integration is None:
                 return solution
-            found = whole_surface(integration.height.numpy(), solved, mask, mean_z=mean_height(camera),
+            found = whole_surface(to_numpy(integration.height), solved, mask, mean_z=mean_height(camera),
                                   perspective=camera.projection == "perspective")
             relief = max(float(np.ptp(found[solved])), 1e-12)
             change = float(np.percentile(np.abs(found - height)[solved], SETTLED_PERCENT)) / relief
@@ -88,7 +89,7 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
         solution.status[restless & (solution.status == Status.OK)] = Status.NOT_CONVERGED
     integration = integrate(given, solution.normal, solved, sigma=solution.standard_error())
     assert integration is not None  # a round without a solved pixel has returned
-    height = whole_surface(integration.height.numpy(), solved, mask, mean_z=mean_height(camera),
+    height = whole_surface(to_numpy(integration.height), solved, mask, mean_z=mean_height(camera),
                            perspective=camera.projection == "perspective")
     solution.facts = {**solution.facts, "near": {"rounds": rounds, "last_change_of_relief": round(change, 6), "settled": settled}}
     solution.height, solution.integration = np.where(solved, height, 0).astype(np.float32), integration

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.posterior.sampling import SHARP, Found
@@ -97,8 +98,8 @@ def open_sources(given: SolveInput, lights: ExtendedLights, padded: Lights, stat
     touched, parts, changes, albedos = [], [], [], []
     for first in range(0, len(pixels), PIXELS_AT_ONCE):
         some = pixels[first : first + PIXELS_AT_ONCE]
-        visible = see_lights(np.pad(place, ((0, 0), (0, 1))), some, surface.height, on_device, projection_of(given.camera),
-                             device=given.device).numpy().reshape(len(place), -1)[:, : len(some)].T > 0
+        visible = to_numpy(see_lights(np.pad(place, ((0, 0), (0, 1))), some, surface.height, on_device, projection_of(given.camera),
+                             device=given.device)).reshape(len(place), -1)[:, : len(some)].T > 0
         reflected = _reflected(Found(*(values[some] for values in found)), view(some), place, weights)
         whole, seen = reflected @ share, (reflected * visible) @ share
         rough = np.where(found.roughness[some] >= SHARP, 1, 0)[:, None]  # a mirror sends its light to one side

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.model.samples import Samples, readings_of
 from kernels.photometric.search.descent import descend
 from kernels.photometric.search.hypotheses import Diffuse
@@ -56,7 +57,7 @@ class Middles(NamedTuple):
 
 def middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Middles:
     """Return the middles of the blocks of an object. `pick`: gives the readings of a few pixels by their positions."""
-    solved = light.solved.numpy() > 0
+    solved = to_numpy(light.solved) > 0
     block, pixels = _blocks(np.flatnonzero(solved), light.given.camera.width)
     return Middles(solved, block, pixels, readings_of(pick(pixels)))
 

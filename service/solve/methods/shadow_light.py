@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.near import LEAST_LOBE, NearField
 from kernels.photometric.lambertian.readings import channel_weights
 from kernels.spread import MAD_TO_SIGMA
@@ -192,7 +193,7 @@ def has_bounced(light: DirectLight, shown: float | None) -> bool:
 
 def largest_scale(light: DirectLight) -> float:
     """Return the scale of albedo above which bright pixels would send on more light than they get."""
-    brightest = float(np.percentile(light.albedo[:, light.solved.numpy().reshape(-1) > 0].max(axis=0), BRIGHT_PERCENTILE))
+    brightest = float(np.percentile(light.albedo[:, to_numpy(light.solved).reshape(-1) > 0].max(axis=0), BRIGHT_PERCENTILE))
     return LARGEST_ALBEDO / max(brightest, 1e-6)
 
 
