@@ -234,6 +234,11 @@ def is_same(device: Any, other: Any) -> bool:
     return device.alias == str(other)
 
 
+def installed() -> bool:
+    """Return whether `cuda:0` is emulated: a GPU has the same name."""
+    return wp.launch is launch
+
+
 def install() -> None:
     """Add the device to those of Warp, for the rest of the process."""
     global emulated, memory

@@ -36,6 +36,8 @@ HORIZON_FRAMES = 32
 """Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
 ROUNDING = 1e-4
 """A direction whose cosine to every normal of a portion is below minus this lights none of its pixels, in float32 neither."""
+NORMALS_AT_ONCE = 4096
+"""Number of normals of a portion that directions are tried on at one time."""
 
 NO_SOURCES = far(np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -153,7 +155,12 @@ class ModelRange:
 
     def _facing(self, portion: Portion) -> np.ndarray:
         """Return the numbers of the directions of the grid that light any pixel of a portion; the responses to all others are 0."""
-        return np.flatnonzero((self._towards @ self._model.normals(portion.position).T).max(axis=1) > -ROUNDING)
+        normals = self._model.normals(portion.position)
+        behind = np.arange(len(self._towards))
+        steps = -(-len(normals) // NORMALS_AT_ONCE)
+        for first in range(steps):  # a direction that lights one pixel need not be tried on the others
+            behind = behind[(self._towards[behind] @ normals[first::steps].T).max(axis=1) <= -ROUNDING]
+        return np.delete(np.arange(len(self._towards)), behind)
 
     def _portion_packs(self, packs: int) -> int:
         """Return how many packs a portion of a batch has, at most."""

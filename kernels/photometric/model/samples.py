@@ -116,23 +116,22 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     device = band.device
     lanes = devices.pack_width(device) if device == "cpu" else devices.LANES_CUDA
     packs = -(-len(pixels) // lanes)
-    last = len(pixels) - 1
-    order = np.minimum(np.arange(packs * lanes), last)
+    padding = packs * lanes - len(pixels)
     pack_stride, light_stride = (light_count, 1) if device == "cpu" else (1, packs)
     lane_type = pack_type(lanes, wp.float32)
     samples = Samples(wp.empty(packs * light_count, dtype=lane_type, device=device),
                       wp.empty((3, packs * light_count), dtype=lane_type, device=device),
                       wp.empty(packs, dtype=lane_type, device=device), wp.empty((3, packs * light_count), dtype=lane_type, device=device),
-                      _upload(view[order].astype(np.float32).T, (3, packs), lanes, device), len(pixels), packs, light_count, lanes,
+                      _upload(view, (3, packs), lanes, device), len(pixels), packs, light_count, lanes,
                       pack_stride, light_stride, device)
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
-    where = wp.array(pixels[order], dtype=wp.int32, device=device)
+    where = wp.array(np.pad(pixels, (0, padding), mode="edge"), dtype=wp.int32, device=device)
     if field is None:
         near = (wp.empty(0, dtype=wp.vec4, device=device),) * 2 + (wp.empty((3, 0), dtype=float, device=device),)
     else:
         near = (wp.array(field.places.place, dtype=wp.vec4, device=device), wp.array(field.places.lobe, dtype=wp.vec4, device=device),
-                wp.array(field.points[:, order], dtype=float, device=device))
+                wp.array(np.pad(field.points, ((0, 0), (0, padding)), mode="edge"), dtype=float, device=device))
     devices.launch(_gather_kernel(lanes, field is not None), packs,
                    [as_pixels(band.values), as_pixels(band.saturated), where, wp.array(factors, dtype=wp.vec3, device=device),
                     wp.array(per_channel, dtype=wp.vec3, device=device), wp.array(lights.direction, dtype=wp.vec3, device=device),
@@ -142,11 +141,18 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
 
 def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
     """Return [n, k] host values of the sampled pixels as [k, packs] packs on the device."""
-    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
-    return _upload(values[order].astype(np.float32).T, (values.shape[1], samples.packs), samples.lanes, samples.device)
+    return _upload(values, (values.shape[1], samples.packs), samples.lanes, samples.device)
 
 
-def _upload(values: np.ndarray, shape: tuple[int, ...], lanes: int, device: str) -> wp.array:
+def _upload(values: np.ndarray, shape: tuple[int, int], lanes: int, device: str) -> wp.array:
+    """Return host values [n, k] as [k, packs] packs on the device, whose last pixel fills the last pack."""
+    planes, count = np.empty((shape[0], shape[1] * lanes), dtype=np.float32), len(values)
+    planes[:, :count] = values.T
+    planes[:, count:] = planes[:, count - 1 : count]
+    return _as_packs(planes, shape, lanes, device)
+
+
+def _as_packs(values: np.ndarray, shape: tuple[int, ...], lanes: int, device: str) -> wp.array:
     """Return host values as packs of this shape on the device; without a shape, Warp drops axes of length one before packs of one."""
     return wp.array(np.ascontiguousarray(values), shape=shape, dtype=pack_type(lanes, wp.float32), device=device)
 
@@ -189,7 +195,7 @@ def device_values(samples: Samples, values: np.ndarray) -> wp.array:
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
     planes = values[order].astype(np.float32).reshape(samples.packs, samples.lanes, samples.light_count)
     planes = planes.transpose(0, 2, 1) if samples.light_stride == 1 else planes.transpose(2, 0, 1)
-    return _upload(planes, samples.grey.shape, samples.lanes, samples.device)
+    return _as_packs(planes, samples.grey.shape, samples.lanes, samples.device)
 
 
 def readings_of(samples: Samples) -> np.ndarray:

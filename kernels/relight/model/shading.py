@@ -85,9 +85,12 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
     planes[-1] = planes[-1] * np.where(planes[5] > 0, np.float32(0.5 / np.pi), 0)  # 1 / 2π of D V; none where there is no lobe
     pack = devices.pack_width(device)
     padded = -(-count // pack) * pack
-    values = np.concatenate(planes, axis=1).T[:, np.minimum(np.arange(padded), count - 1)]
-    packed = np.ascontiguousarray(values.reshape(PLANES, -1, pack))
-    return Surface(wp.array(packed, dtype=pack_type(pack, wp.float32), device=device), count, device)
+    values, row = np.empty((PLANES, padded), dtype=np.float32), 0
+    for plane in planes:
+        values[row : row + plane.shape[1], :count] = plane.T
+        row += plane.shape[1]
+    values[:, count:] = values[:, count - 1 : count]
+    return Surface(wp.array(values.reshape(PLANES, -1, pack), dtype=pack_type(pack, wp.float32), device=device), count, device)
 
 
 def upload_sources(sources: Sources, device: str, counts: Sequence[int] | None = None) -> SourcesOnDevice:

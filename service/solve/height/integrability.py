@@ -10,8 +10,11 @@ Source: integrability as a constraint on normals, Frankot and Chellappa, "A meth
 algorithms", TPAMI 1988; as a measure of their error it is ours.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
+from kernels.device import worker_count
 from kernels.photometric.search.certainty import MOST
 from kernels.surface.slopes import STEEPEST
 from stage.capture.camera import Camera
@@ -23,6 +26,8 @@ REACHES = 3
 """Standard deviations at which the window ends."""
 BAND_PIXELS = 1 << 19
 """Number of pixels that are looked at in one piece: it bounds the memory."""
+MOST_BANDS = 4
+"""Most pieces at one time, of which each takes some hundred MB."""
 BENT = 7.0
 """Standard deviation of normals over their mean misfit, less 1, for each share of the residuals that neighbouring pixels have in common:
 errors that neighbours share bend a surface, and are mostly those of another surface. Measured on path-traced scenes and real objects."""
@@ -63,13 +68,17 @@ def misfit(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Cam
     neighbours are solved to say. Parameters are as for `doubt`."""
     found, reach = np.empty(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
     step = max(1, BAND_PIXELS // height.shape[1])
-    for first in range(0, len(height), step):
+
+    def judge(first: int) -> None:
         above = max(first - reach, 0)
         band = slice(above, first + step + reach)
         points, sight = (camera.points(z, above).astype(np.float64) for z in (height[band], np.ones_like(height[band])))
         if camera.projection == "orthographic":
             sight[..., :2] = 0
         found[first : first + step] = _misfit_of_rows(normal[band].astype(np.float64), points, sight, part[band])[first - above :][:step]
+
+    with ThreadPoolExecutor(min(worker_count(), MOST_BANDS)) as pool:
+        list(pool.map(judge, range(0, len(height), step)))
     return found
 
 
