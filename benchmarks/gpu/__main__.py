@@ -24,11 +24,11 @@ from kernels.errors import DeviceError
 FIGURES, HEADING = Path(__file__).resolve().parents[2] / "docs" / "figures.md", "## On a GPU"
 
 
-def write(lines: list[str]) -> None:
-    """Put the section into docs/figures.md, in place of an older one."""
+def put_section(heading: str, lines: list[str]) -> None:
+    """Put a section into docs/figures.md, in place of an older one."""
     text = FIGURES.read_text(encoding="utf-8")
-    older = re.search(rf"{HEADING}\n.*?(?=\n## |\Z)", text, re.DOTALL)
-    section = "\n".join([HEADING, "", *lines]) + "\n"
+    older = re.search(rf"{heading}\n.*?(?=\n## |\Z)", text, re.DOTALL)
+    section = "\n".join([heading, "", *lines]) + "\n"
     FIGURES.write_text(text.replace(older.group(), section) if older else f"{text.rstrip()}\n\n{section}", encoding="utf-8")
 
 
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(head)
     lines = [f"{head} Medians of {work.REPEATS} runs in one process.", "", *work.measure(device), "", f"*{date.today().isoformat()}*"]
     if args.write:
-        write(lines)
+        put_section(HEADING, lines)
     return 0
 
 

@@ -15,6 +15,7 @@ from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.relight.directions.direction_grid import direction_grid
+from kernels.relight.directions.facing import facing_directions
 from kernels.relight.model.beyond import followed
 from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import ratio_of_sums
@@ -34,11 +35,6 @@ CUDA_PORTIONS = 8
 """Least number of portions of a batch on CUDA: pixels of all normals have no directions behind them."""
 HORIZON_FRAMES = 32
 """Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
-ROUNDING = 1e-4
-"""A direction whose cosine to every normal of a portion is below minus this lights none of its pixels, in float32 neither."""
-NORMALS_AT_ONCE = 4096
-"""Number of normals of a portion that directions are tried on at one time."""
-
 NO_SOURCES = far(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
@@ -155,12 +151,7 @@ class ModelRange:
 
     def _facing(self, portion: Portion) -> np.ndarray:
         """Return the numbers of the directions of the grid that light any pixel of a portion; the responses to all others are 0."""
-        normals = self._model.normals(portion.position)
-        behind = np.arange(len(self._towards))
-        steps = -(-len(normals) // NORMALS_AT_ONCE)
-        for first in range(steps):  # a direction that lights one pixel need not be tried on the others
-            behind = behind[(self._towards[behind] @ normals[first::steps].T).max(axis=1) <= -ROUNDING]
-        return np.delete(np.arange(len(self._towards)), behind)
+        return facing_directions(self._towards, self._model.normals(portion.position))
 
     def _portion_packs(self, packs: int) -> int:
         """Return how many packs a portion of a batch has, at most."""

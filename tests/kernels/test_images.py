@@ -8,6 +8,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels import images
+from kernels.device import to_numpy
 from kernels.images import ImagesOnDevice, Staging
 from kernels.packs import as_pixels
 
@@ -40,7 +41,7 @@ class Noise:
 
     def is_in(self, band, places, pixels):
         """Whether a band has the images of these pixels at these places."""
-        values, bits = (as_pixels(each).numpy()[:, places] for each in (band.values, band.saturated))
+        values, bits = (to_numpy(as_pixels(each))[:, places] for each in (band.values, band.saturated))
         return np.array_equal(values, self.values.reshape(-1, PIXELS)[:, pixels]) and np.array_equal(bits, self.bits[:, pixels])
 
 

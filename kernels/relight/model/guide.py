@@ -9,12 +9,13 @@ Source: the model as a control variate with regression coefficient, Glasserman, 
 section 4.1; here over lights in place of samples.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from kernels.device import once
+from kernels.device import once, worker_count
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.pack_access import pack_load
@@ -26,6 +27,8 @@ from kernels.relight.model.shading import lobes
 
 POOL = 2
 """Half-width, in pixels, of the window over which the sums of β are pooled."""
+POOLED_ROWS = 64
+"""Rows of an image that a thread pools at one time."""
 LEAST_ALPHA = 0.3
 """Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights: α is about half a lobe's width at half its height,
 and between two lights the half vector moves by half of the angle between them (docs/figures.md)."""
@@ -61,11 +64,19 @@ def compare_model(captured: Captured, neighbours: np.ndarray, shares: np.ndarray
 
 def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given, row-major."""
-    rows, cols = np.divmod(pixels, shape[1])
-    table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
-    table[rows + POOL, cols + POOL] = plane
-    across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they would spread a NaN to later pixels
-    return np.asarray(sum(across[k : k + shape[0]] for k in range(2 * POOL + 1))[rows, cols])
+    height, width = shape
+    given, found = np.zeros(height * width), np.empty(shape)
+    given[pixels] = plane
+    framed = np.pad(given.reshape(shape), POOL)
+
+    def pool(first: int) -> None:
+        rows = framed[first : first + POOLED_ROWS + 2 * POOL]
+        across = sum(rows[:, k : k + width] for k in range(2 * POOL + 1))  # no running sums: they would spread a NaN to later pixels
+        found[first : first + POOLED_ROWS] = sum(across[k : k + len(rows) - 2 * POOL] for k in range(2 * POOL + 1))
+
+    with ThreadPoolExecutor(worker_count()) as threads:
+        list(threads.map(pool, range(0, height, POOLED_ROWS)))
+    return np.asarray(found.reshape(-1)[pixels])
 
 
 def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

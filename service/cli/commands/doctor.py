@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from kernels.device import to_numpy
 from service.cli.commands.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
@@ -54,7 +53,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
-            sound = bool((to_numpy(combine(band, np.full((3, 8), 0.25, dtype=np.float32))) == 2.0).all())
+            sound = bool((device.to_numpy(combine(band, np.full((3, 8), 0.25, dtype=np.float32))) == 2.0).all())
             print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")
             if name != "cpu":
                 print(f"{'cuBLAS':<12} {name}: {cublas.describe(name)}")
@@ -106,6 +105,7 @@ def _wrong_products(device: str) -> list[str]:
     import numpy as np
 
     from kernels import packs
+    from kernels.device import to_numpy
     from kernels.relight.frames import cublas
     from kernels.relight.frames.combine import combine_batch
 

@@ -2,11 +2,17 @@
 
 const SOON_MS = 250; // browsers refuse addresses that change faster for long
 
-const pending = new Map(); // what is to be written, by its address
+const pending = new Map(); // what is to be written, and when, by its address
+
+// Back, Forward and links: what was to be written is of the page as it was left, and the address is another's
+addEventListener("popstate", () => {
+  for (const { timer } of pending.values()) clearTimeout(timer);
+  pending.clear();
+});
 
 /** Write at once what is to be written soon, as before the address becomes that of something else. */
 export function writeNow() {
-  for (const write of pending.values()) write();
+  for (const { write } of pending.values()) write();
 }
 
 /** Return the names and texts that the address has, in their order. */
@@ -47,7 +53,7 @@ export class Address {
       history.replaceState(null, "", `#${[this.text(this.#source), ...others].filter((part) => part !== "").join("&")}`);
     };
     const timer = setTimeout(write, SOON_MS);
-    pending.set(this, write);
+    pending.set(this, { write, timer });
   }
 
   /** Return what the address says of an object; what it lacks is left out. */
