@@ -35,6 +35,10 @@ SAMPLES = 256
 """Paths of each pixel in Blender."""
 REACH_M = 0.002
 """Distance beyond which there is no fused surface at a place, metres."""
+AROUND = 5
+"""Nearest pixels of all views, some half of a pixel away, between which the true normals are compared."""
+EVEN_DEGREES = 6.0
+"""Difference between them up to which a pixel shows one normal."""
 COMMANDS = (("solve", "views", "--no-temporal", "--out", "solved"), ("depth", "views", "--no-temporal", "--out", "depth"),
             ("fuse", "scan-set.json", "--join-normals", "--out", "fused"))
 
@@ -46,6 +50,8 @@ class Errors(NamedTuple):
     out: np.ndarray  # [V] metres, of the vertices from the true surface
     back: np.ndarray  # [P] metres, of what the pixels of all views show from the fused surface
     angle: np.ndarray  # [Q] degrees, of the normals of the fused surface where it is within REACH_M of what the pixels show
+    turn: np.ndarray  # [Q] degrees, by which the true normals of these pixels differ from those of the nearest others, in the mean
+    fine: np.ndarray  # [P] degrees, of the normals of the true surface itself at its vertex that is nearest
 
 
 def run(folder: Path) -> list[tuple[str, float, float]]:
@@ -66,14 +72,21 @@ def surface_errors(folder: Path) -> Errors:
     or of the surface (voxels as fine)."""
     found, truth = read_ply_points(folder / "fused" / MESH_FILE), np.load(folder / "truth.npz")
     assert found.normals is not None
-    _, nearest = cKDTree(truth["points"]).query(found.points)
+    true, seen = cKDTree(truth["points"]), truth["seen_points"]
+    _, nearest = true.query(found.points)
     out = np.abs(np.einsum("nx,nx->n", found.points - truth["points"][nearest], truth["normals"][nearest]))
-    seen = truth["seen_points"]
     distance, near = cKDTree(found.points).query(seen)
     there = distance < REACH_M
     back = np.where(there, np.abs(np.einsum("nx,nx->n", seen - found.points[near], found.normals[near])), distance)
-    angle = np.degrees(np.arccos(np.clip(np.einsum("nx,nx->n", found.normals[near], truth["seen_normals"]), -1, 1)))
-    return Errors(len(found.points), out, back, angle[there])
+    given = truth["seen_normals"]
+    turn = np.mean([between(given, given[other]) for other in cKDTree(seen).query(seen, k=AROUND + 1)[1].T[1:]], axis=0)
+    return Errors(len(found.points), out, back, between(found.normals[near], given)[there], turn[there],
+                  between(truth["normals"][true.query(seen)[1]], given))
+
+
+def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the angles, degrees, between unit vectors [n, 3]."""
+    return np.degrees(np.arccos(np.clip(np.einsum("nx,nx->n", one, other), -1, 1)))
 
 
 class Shown(NamedTuple):
@@ -99,6 +112,15 @@ def unseen_views(folder: Path) -> list[Shown]:
     return views
 
 
+def normal_rows(found: Errors) -> list[str]:
+    """Return what the table says of normals."""
+    even = found.turn < EVEN_DEGREES
+    return [f"| normals: mean; median; 99 % | {_spread(found.angle)}° |",
+            f"| normals where those of the truth turn by less than {EVEN_DEGREES:g}° between neighbours, {even.mean():.0%} of the pixels | "
+            f"{_spread(found.angle[even])}° |",
+            f"| normals of the true surface itself, by its nearest vertex | {_spread(found.fine)}° |"]
+
+
 def _spread(values: np.ndarray) -> str:
     return f"{values.mean():.3f}; {np.median(values):.3f}; {np.percentile(values, 99):.3f}"
 
@@ -120,7 +142,7 @@ def main() -> None:
              f"| surface from the truth: mean; median; 99 % | {_spread(MM * found.out)} mm |",
              f"| truth in sight from the surface: mean; median; 99 % | {_spread(MM * found.back)} mm |",
              f"| Chamfer distance, mean of both | {MM * (found.out.mean() + found.back.mean()) / 2:.3f} mm |",
-             f"| normals: mean; median; 99 % | {_spread(found.angle)}° |",
+             *normal_rows(found),
              f"| unseen views in Blender, RMSE over the mean | {'; '.join(f'{view.error:.3f}' for view in views)} |"]
     text = "\n".join(table)
     print(text)
