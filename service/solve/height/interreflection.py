@@ -67,6 +67,10 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     """
     camera, projection = given.camera, projection_of(given.camera)
     rows, cols = solved.shape
+    perspective = camera.projection == "perspective"
+    places = to_numpy(height)
+    if perspective:  # a pixel without neighbours has no height, and would stand at the camera
+        solved = solved & (places != 0)
     side = max(1, math.ceil(math.sqrt(solved.sum() / PATCHES)))
     shape = (-(-rows // side), -(-cols // side))
     pixels = np.flatnonzero(solved)
@@ -84,10 +88,9 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
         sums = np.stack([np.bincount(patch, weights=plane, minlength=len(kept)) for plane in values.T], axis=1)
         return sums / count[kept][:, None]
 
-    surface = camera.points(to_numpy(height)).reshape(-1, 3)[pixels]
+    surface = camera.points(places).reshape(-1, 3)[pixels]
     centres, facing = mean(surface), mean(normal[:, pixels].T)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-    perspective = camera.projection == "perspective"
     to_viewer = -centres / np.linalg.norm(centres, axis=1, keepdims=True) if perspective else np.array([[0.0, 0.0, 1.0]])
     pixel = (-centres[:, 2] if perspective else np.ones(len(kept))) / float(np.mean(projection.scale))
     areas = count[kept] * pixel**2 / np.maximum((facing * to_viewer).sum(axis=1), LEAST_FACING)
