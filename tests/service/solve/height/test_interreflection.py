@@ -17,11 +17,12 @@ def thrown(solved):
     across = np.linspace(-1, 1, SIDE)
     height = np.broadcast_to(-1 - 0.3 * np.abs(across), (SIDE, SIDE)).astype(np.float32).copy()
     height[LONELY] = 0
-    normal = np.stack([-0.3 * np.sign(across), np.zeros(SIDE), np.ones(SIDE)]) / np.hypot(0.3, 1)
+    slopes = np.stack([-0.3 * np.sign(across), np.zeros(SIDE), np.ones(SIDE)]) / np.hypot(0.3, 1)
+    normal = np.repeat(slopes[:, None], SIDE, axis=1).reshape(3, -1).astype(np.float32)
     stack = SimpleNamespace(light_count=1, pick=lambda pixels: (np.ones((3, 8, len(pixels)), np.float16), None))
     given = SimpleNamespace(camera=camera, stack=stack, device="cpu")
-    return arriving_light(given, pad_lights(np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3))),
-                          np.repeat(normal[:, None], SIDE, axis=1).reshape(3, -1).astype(np.float32), wp.array(height, device="cpu"), solved)
+    lights = pad_lights(np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)))
+    return arriving_light(given, lights, normal, wp.array(height, device="cpu"), solved)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
