@@ -138,7 +138,7 @@ def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tm
     whole = len(direction_grid().direction)
     assert max(asked) < 0.9 * whole
     asked.clear()
-    monkeypatch.setattr("service.relight.model_range.ROUNDING", 2.0)
+    monkeypatch.setattr("kernels.relight.directions.facing.ROUNDING", 2.0)
     every = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}")
     assert max(asked) == whole
     for number in (1, FRAMES):
