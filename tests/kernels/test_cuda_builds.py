@@ -64,6 +64,16 @@ def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(name, tmp_pat
 
 
 @pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
+@pytest.mark.parametrize(("place", "is_fused"), [("surface.conjugate.", False), ("surface.multigrid.", False), ("surface.slopes.", True)])
+def test_the_height_solver_rounds_each_product(place, is_fused, tmp_path):
+    """Products fused with sums broke it on a GPU, which rounds as the PTX says; that of other kernels shows what to look for."""
+    name = next(name for name in KERNELS if name.startswith(place))
+    wp.compile_aot_module(KERNELS[name]().module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
+    path, = tmp_path.glob("*.ptx")
+    assert (b"fma.rn.f32" in path.read_bytes()) == is_fused
+
+
+@pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
 def test_kernels_made_ahead_are_what_another_process_looks_for(tmp_path, monkeypatch):
     names = "relight.model.shading._shade_kernel", "surface.multigrid._smooth_from_zero"
     monkeypatch.setattr(ahead, "every_kernel", lambda: {name: KERNELS[name] for name in names})
