@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.accuracy import angles_deg
 from benchmarks.clients.comparison import compare
 from benchmarks.clients.render import Client, Programs, Sun
 from benchmarks.file_mutations import write_between
@@ -79,14 +80,9 @@ def surface_errors(folder: Path) -> Errors:
     there = distance < REACH_M
     back = np.where(there, np.abs(np.einsum("nx,nx->n", seen - found.points[near], found.normals[near])), distance)
     given = truth["seen_normals"]
-    turn = np.mean([between(given, given[other]) for other in cKDTree(seen).query(seen, k=AROUND + 1)[1].T[1:]], axis=0)
-    return Errors(len(found.points), out, back, between(found.normals[near], given)[there], turn[there],
-                  between(truth["normals"][true.query(seen)[1]], given))
-
-
-def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the angles, degrees, between unit vectors [n, 3]."""
-    return np.degrees(np.arccos(np.clip(np.einsum("nx,nx->n", one, other), -1, 1)))
+    turn = np.mean([angles_deg(given, given[other]) for other in cKDTree(seen).query(seen, k=AROUND + 1)[1].T[1:]], axis=0)
+    return Errors(len(found.points), out, back, angles_deg(found.normals[near], given)[there], turn[there],
+                  angles_deg(truth["normals"][true.query(seen)[1]], given))
 
 
 class Shown(NamedTuple):

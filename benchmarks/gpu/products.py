@@ -12,8 +12,6 @@ import json
 import os
 import shutil
 import sys
-import time
-from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
@@ -22,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.gpu.__main__ import put_section
+from benchmarks.large import StagePeaks
 from kernels import device as devices
 from service.relight.relight import relight
 from service.requests.relight import LightWeights, RelightRequest
@@ -35,22 +34,6 @@ SIDE, TILES, FRAMES = 256, 12, 24
 HEADING = "## Products on a GPU"
 BRIEF_S = 0.5
 """Stages that take less are not named."""
-
-
-class Stages:
-    """A Progress that adds up the seconds of each stage."""
-
-    def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
-        self._name, self._began = "start", time.perf_counter()
-
-    def stage(self, name: str, total: int) -> None:
-        now = time.perf_counter()
-        self.seconds[self._name] += now - self._began
-        self._name, self._began = name, now
-
-    def advance(self, done: int) -> None:
-        """Take no note."""
 
 
 def write_capture(folder: Path, tiles: int) -> tuple[int, int]:
@@ -74,13 +57,13 @@ def write_capture(folder: Path, tiles: int) -> tuple[int, int]:
     return rows * SIDE, cols * SIDE
 
 
-def row(name: str, work: Callable[[Stages], object]) -> str:
+def row(name: str, work: Callable[[StagePeaks], object]) -> str:
     """Do work; return its row of the table."""
-    stages = Stages()
-    work(stages)
-    stages.stage("", 1)
-    named = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in stages.seconds.items() if seconds >= BRIEF_S)
-    line = f"| {name} | {stages.seconds.total():.1f} | {named} |"
+    peaks = StagePeaks(name)
+    work(peaks)
+    peaks.close()
+    named = ", ".join(f"{stage.name} {stage.seconds:.1f}" for stage in peaks.stages if stage.seconds >= BRIEF_S)
+    line = f"| {name} | {sum(stage.seconds for stage in peaks.stages):.1f} | {named} |"
     print(line, flush=True)
     return line
 
@@ -91,12 +74,12 @@ def measure(folder: Path, frames: int, device: str) -> list[str]:
 
     def solved(method: Method) -> str:
         request = SolveRequest(capture=capture, out=folder / method.value, method=method, device=device)
-        return row(f"solve, `{method.value}`", lambda stages: solve(request, stages))
+        return row(f"solve, `{method.value}`", lambda peaks: solve(request, peaks))
 
     def relit(name: str, maps: Path | None) -> str:
         request = RelightRequest(capture=capture, environment=sky, out=str(folder / "frames" / "f.#.exr"), frames=f"1-{frames}",
                                  spin_degrees=60, weights=None if maps else LightWeights.CELLS, maps=maps, device=device)
-        line = row(f"relight, {frames} {name} frames", lambda stages: relight(request, stages))
+        line = row(f"relight, {frames} {name} frames", lambda peaks: relight(request, peaks))
         shutil.rmtree(folder / "frames")
         return line
 

@@ -69,7 +69,7 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     rows, cols = solved.shape
     perspective = camera.projection == "perspective"
     places = to_numpy(height)
-    if perspective:  # a pixel without neighbours has no height, and would stand at the camera
+    if perspective:  # a pixel without height would stand at the camera
         solved = solved & (places != 0)
     side = max(1, math.ceil(math.sqrt(solved.sum() / PATCHES)))
     shape = (-(-rows // side), -(-cols // side))
