@@ -23,9 +23,10 @@ from benchmarks.accuracy import angles_deg
 from benchmarks.clients.comparison import compare
 from benchmarks.clients.render import Client, Programs, Sun
 from benchmarks.file_mutations import write_between
+from kernels.surface.nearest import NearestOnMesh
 from service.relight.sheet import write_sheet
 from service.scans.fusion.fuse import ASSET_FILE, MESH_FILE
-from service.scans.points.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.capture.camera import Camera
 from stage.formats import exr
 
@@ -52,7 +53,6 @@ class Errors(NamedTuple):
     back: np.ndarray  # [P] metres, of what the pixels of all views show from the fused surface
     angle: np.ndarray  # [Q] degrees, of the normals of the fused surface where it is within REACH_M of what the pixels show
     turn: np.ndarray  # [Q] degrees, by which the true normals of these pixels differ from those of the nearest others, in the mean
-    fine: np.ndarray  # [P] degrees, of the normals of the true surface itself at its vertex that is nearest
 
 
 def run(folder: Path) -> list[tuple[str, float, float]]:
@@ -69,20 +69,34 @@ def run(folder: Path) -> list[tuple[str, float, float]]:
 
 
 def surface_errors(folder: Path) -> Errors:
-    """Measure the fused surface. Distances are along the normal of the nearest vertex, of the truth (edges of a quarter of a millimetre)
-    or of the surface (voxels as fine)."""
-    found, truth = read_ply_points(folder / "fused" / MESH_FILE), np.load(folder / "truth.npz")
-    assert found.normals is not None
-    true, seen = cKDTree(truth["points"]), truth["seen_points"]
-    _, nearest = true.query(found.points)
-    out = np.abs(np.einsum("nx,nx->n", found.points - truth["points"][nearest], truth["normals"][nearest]))
-    distance, near = cKDTree(found.points).query(seen)
-    there = distance < REACH_M
-    back = np.where(there, np.abs(np.einsum("nx,nx->n", seen - found.points[near], found.normals[near])), distance)
-    given = truth["seen_normals"]
-    turn = np.mean([angles_deg(given, given[other]) for other in cKDTree(seen).query(seen, k=AROUND + 1)[1].T[1:]], axis=0)
-    return Errors(len(found.points), out, back, angles_deg(found.normals[near], given)[there], turn[there],
-                  angles_deg(truth["normals"][true.query(seen)[1]], given))
+    """Measure the fused surface. Distances are those from the nearest point of the other mesh, and a normal there is blended from those of
+    the corners of its face, as programs shade."""
+    ply, truth = folder / "fused" / MESH_FILE, np.load(folder / "truth.npz")
+    vertices = read_ply_points(ply)
+    faces = read_ply_faces(ply, vertices.kept)
+    assert vertices.normals is not None and faces is not None
+    found, true = Shaded(vertices.points, faces, vertices.normals), Shaded(truth["points"], truth["faces"], truth["normals"])
+    seen, given = truth["seen_points"], truth["seen_normals"]
+    back, normals = found.nearest(seen)
+    there = back < REACH_M
+    around = cKDTree(seen).query(seen, k=AROUND + 1)[1].T[1:]
+    turn = np.mean([angles_deg(given, given[other]) for other in around], axis=0)
+    return Errors(len(vertices.points), true.nearest(vertices.points)[0], back, angles_deg(normals, given)[there], turn[there])
+
+
+class Shaded(NamedTuple):
+    """A mesh with a normal of each vertex."""
+
+    points: np.ndarray  # [V, 3] metres
+    faces: np.ndarray  # [F, 3]
+    normals: np.ndarray  # [V, 3]
+
+    def nearest(self, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance of each of [n, 3] points, metres, and the normal at the nearest point of the mesh, [n, 3]."""
+        found = NearestOnMesh(self.points, self.faces, device="cpu").search(to, within=1.0)
+        corners = self.faces[found.face]
+        at, normals = (np.einsum("nk,nkx->nx", found.share, values[corners]) for values in (self.points, self.normals))
+        return np.linalg.norm(to - at, axis=1), normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 class Shown(NamedTuple):
@@ -113,8 +127,7 @@ def normal_rows(found: Errors) -> list[str]:
     even = found.turn < EVEN_DEGREES
     return [f"| normals: mean; median; 99 % | {_spread(found.angle)}° |",
             f"| normals where those of the truth turn by less than {EVEN_DEGREES:g}° between neighbours, {even.mean():.0%} of the pixels | "
-            f"{_spread(found.angle[even])}° |",
-            f"| normals of the true surface itself, by its nearest vertex | {_spread(found.fine)}° |"]
+            f"{_spread(found.angle[even])}° |"]
 
 
 def _spread(values: np.ndarray) -> str:

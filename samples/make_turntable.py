@@ -1,6 +1,6 @@
 """Render a light-stage turntable: twelve views of the owl at half its size, each with its lamps and a projector's patterns, and the truth.
 
-    python samples/make_turntable.py --out turntable        # about 10 minutes on 2 idle cores, outside the repository
+    python samples/make_turntable.py --out turntable        # about 20 minutes on 2 idle cores, outside the repository
 
 `views/000` … `views/330` are captures by one perspective camera, of the object turned by that many degrees: 32 distant lights, then
 phase shifting of three periods, white and black, with shot and read noise. `scan-set.json` names the results that `relit solve` and
@@ -35,7 +35,7 @@ from stage.patterns.phase import phase_patterns
 from stage.sets.scan_set import Turntable
 from stage.transforms import rotation_about, rotation_about_y
 
-VIEWS, SIZE_PX, FOCAL_PX, DISTANCE_M = 12, 256, 1070.0, 0.55
+VIEWS, SIZE_PX, FOCAL_PX, DISTANCE_M = 12, 512, 2140.0, 0.55
 SCALE = 0.5  # of the owl of samples/owl: 0.1 m tall
 LIGHTS, LARGEST_ANGLE_DEGREES, IRRADIANCE = 32, 80.0, 3.0
 PROJECTOR_PX, PROJECTOR_FOCAL_PX, PROJECTOR_ANGLE_DEGREES = (256, 192), 800.0, 20.0
@@ -146,7 +146,9 @@ def write_truth(mi, shapes: dict, surfaces: dict, path: Path, turns: list[float]
         si = scene.ray_intersect(rays(mi, pose, column + 0.5, row + 0.5))
         points.append(np.array(si.p).T[inside])
         normals.append(np.array(si.sh_frame.n).T[inside])
+    before = np.cumsum([0, *(len(part.points) for part in surfaces.values())])
     np.savez(path, points=np.concatenate([part.points for part in surfaces.values()]),
+             faces=np.concatenate([part.faces + first for part, first in zip(surfaces.values(), before, strict=False)]),
              normals=np.concatenate([part.normals for part in surfaces.values()]), seen_points=np.concatenate(points),
              seen_normals=np.concatenate(normals))
 
@@ -155,7 +157,7 @@ def main() -> None:
     """Render what is still missing."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument("--spp", type=int, default=36, help="paths per pixel and frame, a square number (default 36)")
+    parser.add_argument("--spp", type=int, default=16, help="paths per pixel and frame, a square number (default 16)")
     parser.add_argument("--detail", type=float, default=0.06, help="mesh edge of the owl in centimetres (default 0.06)")
     args = parser.parse_args()
     started = time.perf_counter()

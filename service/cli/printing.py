@@ -42,7 +42,8 @@ def print_sequence(result: "SequenceResult") -> None:
     """Print what was made of a sequence, and end with the exit code 1 where no pixel is solved."""
     print(f"steps    {result.sequence_path} ({len(result.names)} steps, {result.kept} done before)")
     print(f"report   {result.report_path}")
-    print(f"joined   {100 * result.joined:.0f} % of the pixels of consecutive steps agree")
+    if result.joined is not None:
+        print(f"joined   {100 * result.joined:.0f} % of the pixels of consecutive steps agree")
     print_warnings(result.warnings)
     if not result.solved:
         raise typer.Exit(1)

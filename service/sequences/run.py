@@ -37,8 +37,8 @@ class SequenceResult(NamedTuple):
     names: tuple[str, ...]
     kept: int
     """Steps that were done before."""
-    joined: float
-    """Share of the pixels with an estimate in two consecutive steps that agreed, over all steps."""
+    joined: float | None
+    """Share of the pixels with an estimate in two consecutive steps that agreed, over all steps; None: each step stands alone."""
     solved: int
     """Pixels of all steps."""
     warnings: tuple[str, ...]
@@ -120,7 +120,9 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
          result: str) -> SequenceResult:
     timings = Timings(progress)
     rows: list[dict[str, Any]] = []
-    warnings: list[str] = [] if sequence.timed or request.frame_rate is not None else [UNTIMED.format(sequence.frames_per_second)]
+    warnings: list[str] = []
+    if request.temporal and not sequence.timed and request.frame_rate is None:
+        warnings.append(UNTIMED.format(sequence.frames_per_second))
     kept = solved = agreed = compared = 0
     methods: dict[str, str] = {}
     said: dict[str, list[str]] = {}
@@ -151,5 +153,6 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
         warnings=warnings,
         timings_s=timings.close(),
     ))
-    return SequenceResult(request.out / SEQUENCE_FILE, report_path, tuple(step.name for step in sequence.steps), kept,
-                          agreed / compared if compared else 0.0, solved, tuple(warnings))
+    share = (agreed / compared if compared else 0.0) if request.temporal else None
+    return SequenceResult(request.out / SEQUENCE_FILE, report_path, tuple(step.name for step in sequence.steps), kept, share, solved,
+                          tuple(warnings))

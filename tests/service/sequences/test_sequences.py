@@ -193,9 +193,11 @@ def test_the_command_says_what_it_made_and_without_joining_each_step_is_a_solve(
     write_sequence(tmp_path / "in", [None] * 2, size=16, noise=NOISE)
     out = relit("solve", tmp_path / "in", "--out", tmp_path / "joined", "--method", "lambert").well()
     assert "(2 steps, 0 done before)" in out and "taken at 24 a second" in out
+    out = relit("solve", tmp_path / "in", "--no-temporal", "--out", tmp_path / "alone", "--method", "lambert").well()
+    assert "taken at" not in out and "joined" not in out
     result = solve_sequence(request(tmp_path, temporal=False, frame_rate=12.5))
     assert files_in(tmp_path / "out" / "step01") == {"maps.exr", "report.json", "step.json"}
-    assert result.joined == 0 and json.loads((tmp_path / "out" / "sequence.json").read_text())["frames_per_second"] == 12.5
+    assert result.joined is None and json.loads((tmp_path / "out" / "sequence.json").read_text())["frames_per_second"] == 12.5
 
 
 @pytest.mark.long
