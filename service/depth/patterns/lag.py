@@ -68,9 +68,9 @@ class LagFinding(NamedTuple):
     def sentence(self, axis: str) -> str:
         """Return what a user is told."""
         return (f"frames[].pattern: {axis}s that different {axis} patterns show differ by {self.usual_px:.2g} px at "
-                f"{100 * self.share:.0f} % of the pixels, as where light runs below the surface of translucent things, or where frames "
-                "hold part of the next pattern: the standard deviations hold about what that makes; cover such things with matt paint or "
-                "powder")
+                f"{100 * self.share:.0f} % of the pixels, as where light bounces between folds or runs below the surface of translucent "
+                "things, or where frames hold part of the next pattern: the standard deviations hold about what that makes; cover "
+                "translucent things with matt paint or powder")
 
 
 class Lags(NamedTuple):

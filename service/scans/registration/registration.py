@@ -47,7 +47,7 @@ class RegistrationOptions:
     accept_alike: bool = False
     """Whether a pose is taken although turned ones pass all tests as well."""
     starts_decide: bool = False
-    """Whether starts are taken in directions that the surfaces leave open."""
+    """Whether starts are taken in directions that the surfaces leave open, and although parts of the surfaces are seen through."""
     threads: int = 1
     """Pairs that are registered at one time."""
 
@@ -137,6 +137,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         return _solved(count, [*pairs.values(), *targeted.values()], starts, options, table)
 
     solved, kept = solve_all()
+    started = options.starts_decide and all(starts[number] is not None for number in cells)
     tried: set[tuple[int, int]] = set()
     advance(0.75)
     unlike = _untried(outlines, starts, pairs)
@@ -147,7 +148,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
                 break
             pairs |= found
             solved, kept = solve_all()
-        told = any(pair.fit is not None for pair in targeted.values())  # by targets, which tell a body from its turned self
+        told = any(pair.fit is not None for pair in targeted.values()) or started  # by what tells a body from its turned self
         wrong = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and count <= ALL_PAIRS and not told else {}
         if wrong:
             pairs |= wrong
@@ -176,7 +177,8 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         ambiguous = any(pair.state is PairState.AMBIGUOUS and number in (pair.a, pair.b) for pair in pairs.values())
         words = None if ambiguous else why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
                                                   least_overlap=options.least_overlap)  # what looks alike turned does so mirrored
-        alone[number] = (words or _refusal(number, names, pairs.values())) + _refused_targets(number, names, shown, targeted.values())
+        words = words or _refusal(number, names, pairs.values(), starts[number] is not None and not options.starts_decide)
+        alone[number] = words + _refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:
         raise NoneJoinedError(names, alone, (*pairs.values(), *targeted.values()))
@@ -324,8 +326,8 @@ def _reference(numbers: Iterable[int], starts: Sequence[np.ndarray | None], opti
     return min(numbers, key=lambda number: (number != options.reference, starts[number] is None, number))
 
 
-def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair]) -> str:
-    """Return why a scan could not be joined, by the pair that came nearest to it."""
+def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair], may_decide: bool) -> str:
+    """Return why a scan could not be joined, by the pair that came nearest to it; `may_decide`: it has a start, which does not."""
     tried = [pair for pair in pairs if number in (pair.a, pair.b) and pair.state is not PairState.NO_POSE]
     if not tried:
         return "has no surface in common with the others"
@@ -335,8 +337,9 @@ def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair]) -> str:
     other = names[best.b if best.a == number else best.a]
     if best.state is PairState.JOINED:
         return f"is joined with {other} alone, and neither with the largest group of scans"
-    further = ": give its turntable or pose and keep that fixed" if best.state is PairState.AMBIGUOUS else ""
-    return f"against {other}, {best.reason}{further}"
+    advice = {PairState.AMBIGUOUS: ": give its turntable or pose and keep that fixed",
+              PairState.CONTRADICTED: ": --starts joins it if its start is right" if may_decide else ""}
+    return f"against {other}, {best.reason}{advice.get(best.state, '')}"
 
 
 def _refused_targets(number: int, names: Sequence[str], shown: Mapping[int, Sequence[Target]], pairs: Iterable[Pair]) -> str:

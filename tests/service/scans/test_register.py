@@ -147,6 +147,26 @@ def test_starts_decide_where_the_surface_does_not(relit, tmp_path):
     assert "has no two scans with a pose" in relit.refused("register", folder, "--out", tmp_path / "no", "--starts")
 
 
+def test_wrong_depths_do_not_refuse_a_start_that_decides(relit, tmp_path):
+    """A disc of the surface is measured 40 mm before itself, as in folds that light bounces in: 2 % of the pixels of a scan."""
+    seen = list(views(figure, 0, 30))
+    row, column = np.argwhere(seen[1].mask).mean(axis=0)
+    rows, cols = np.indices(seen[1].mask.shape)
+    disc = seen[1].mask & (np.hypot(rows - row, cols - column) < np.sqrt(0.02 * seen[1].mask.sum() / np.pi))
+    seen[1] = seen[1]._replace(depth=np.where(disc, seen[1].depth - 40 * MM, seen[1].depth).astype(np.float32))
+    poses = [view.world_from_scan @ np.eye(4) for view in seen]
+    poses[1][:3, 3] += 8 * MM
+    folder = write(tmp_path / "set", tuple(seen), **{f"s{number}": {"scan_to_world": each.tolist()} for number, each in enumerate(poses)})
+    assert "saw through: --starts" in relit.refused("register", folder, "--out", tmp_path / "none")
+    outcome = relit("register", folder, "--out", tmp_path / "out", "--starts")
+    assert outcome.code == 0 and "depths there are wrong" in outcome.out + outcome.err
+    shift, degrees = off(tmp_path / "out", tuple(seen))["s1"]
+    assert shift < 0.2 * MM and degrees < 0.1  # a fiftieth of a pixel, as of the scans without the disc
+    poses[1][:3] = rotation_about((0.0, 1.0, 0.0), 90.0) @ poses[1][:3]
+    folder = write(tmp_path / "set", tuple(seen), **{f"s{number}": {"scan_to_world": each.tolist()} for number, each in enumerate(poses)})
+    relit.refused("register", folder, "--out", tmp_path / "turned", "--starts")
+
+
 @pytest.mark.parametrize("given", [(0.0, 29.0, 61.0), None], ids=["rough angles", "no angles"])
 def test_the_angles_of_a_turntable_are_refined(relit, tmp_path, given):
     seen = views(figure, 0, 30, 60)
