@@ -63,12 +63,13 @@ def _fit(depth: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, came
             here = slice(0, height - down), slice(max(-right, 0), width - max(right, 0))
             there = slice(down, height), slice(max(right, 0), width - max(-right, 0))
             one = connected(depth, mask, camera, (down, right), sigma=sigma)[here]
-            dx, dy, di = (plane[there] - plane[here] for plane in (x, y, inverse))
-            for pixel, sign in ((here, 1), (there, -1)):  # each is a neighbour of the other
+            dx, dy, di = (one * (plane[there] - plane[here]) for plane in (x, y, inverse))
+            for pixel in (here, there):  # each is a neighbour of the other
                 count[pixel] += one
-                for name, value in (("x", sign * dx), ("y", sign * dy), ("i", sign * di), ("xx", dx * dx), ("xy", dx * dy),
-                                    ("yy", dy * dy), ("xi", dx * di), ("yi", dy * di)):
-                    sums[name][pixel] += one * value
+            for name, value, sign in (("x", dx, -1), ("y", dy, -1), ("i", di, -1), ("xx", dx * dx, 1), ("xy", dx * dy, 1),
+                                      ("yy", dy * dy, 1), ("xi", dx * di, 1), ("yi", dy * di, 1)):
+                sums[name][here] += value
+                sums[name][there] += sign * value
     n = np.maximum(count, 1)
     mean_x, mean_y, mean_i = sums["x"] / n, sums["y"] / n, sums["i"] / n
     xx, xy, yy = sums["xx"] / n - mean_x**2, sums["xy"] / n - mean_x * mean_y, sums["yy"] / n - mean_y**2

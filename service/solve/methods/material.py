@@ -270,7 +270,7 @@ class _Walk:
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
             error = albedo_error(samples, found.normal, material, shape=self._lobe, shared=MATT[None] if self._matt else materials)
-            own[:, pixels], tilt[:, pixels] = error.own.T, error.tilt.T
+            own[:, pixels], tilt[:, pixels] = (np.minimum(each.T, np.finfo(np.float16).max) for each in error)
             abundance[pixels], pair[pixels] = found.mixture
             sigma[pixels], result.residual[pixels] = found.sigma, found.residual
 
