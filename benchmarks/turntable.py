@@ -42,7 +42,7 @@ AROUND = 5
 EVEN_DEGREES = 6.0
 """Difference between them up to which a pixel shows one normal."""
 COMMANDS = (("solve", "views", "--no-temporal", "--out", "solved"), ("depth", "views", "--no-temporal", "--out", "depth"),
-            ("fuse", "scan-set.json", "--join-normals", "--out", "fused"))
+            ("fuse", "scan-set.json", "--join-normals", "--close", "all", "--out", "fused"))
 
 
 class Errors(NamedTuple):

@@ -14,12 +14,13 @@ import numpy as np
 import warp as wp
 
 from kernels.device import to_numpy
-from kernels.fusion.bricks import BRICK_VOXELS, find_blocks
+from kernels.fusion.bricks import BRICK_VOXELS, MARGIN_VOXELS, find_blocks
 from kernels.fusion.extract import extract
 from kernels.fusion.gather import gather
 from kernels.fusion.integrate import integrate
+from kernels.fusion.resample import STEEPEST, STEP_SIGMAS
 from kernels.fusion.residuals import FUSED, LOST, REFUSED, residuals
-from kernels.fusion.views import LEAST_COSINE, TRUNCATION_SIGMAS, TRUNCATION_VOXELS, ViewArrays, corners_of, upload_views
+from kernels.fusion.views import TRUNCATION_SIGMAS, TRUNCATION_VOXELS, ViewArrays, corners_of, upload_views
 from service.asset.content.mesh import vertex_normals
 from service.scans.fusion.boxes import LEAST_VOXELS, Box, Watching, boxes
 from service.scans.fusion.closing import Closed
@@ -235,22 +236,34 @@ def world_points(scan: PreparedScan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def places_near(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the smallest boxes that the measured surface of a scan comes near, as the lattice coordinates [n, 3] of their lowest
-    voxels."""
-    size = LEAST_VOXELS * voxel
+    """Return the smallest boxes in which `find_blocks` may find blocks for a scan, as the lattice coordinates [n, 3] of their lowest
+    voxels: those along the line of sight of each pixel, as far before and behind its surface as its own noise and a steep cell reach."""
+    size, image = LEAST_VOXELS * voxel, scan.image
     points, used = world_points(scan)
-    if len(points) == 0:
-        return np.zeros((0, 3), dtype=np.int64)
-    sigma = float(np.asarray(scan.image.sigma).ravel()[used].max())
-    depth = float(np.asarray(scan.image.depth).ravel()[used].max())
-    reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + scan.image.pixel_m(depth)
-    low, high = (np.floor((points - origin + side * reach) / size).astype(np.int64) for side in (-1, 1))
-    beyond = int((high - low).max()) + 1
-    base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
-    numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *[beyond] * 3))
-    ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *[beyond] * 3)), axis=1)  # few, so that each is looked at alone
-    return LEAST_VOXELS * np.unique(np.concatenate([base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)]
-                                                    for step in np.ndindex(*[beyond] * 3)]), axis=0)
+    sigma, depth = (np.asarray(values).ravel()[used].astype(np.float64) for values in (image.sigma, image.depth))
+    noise, pixel = np.minimum(sigma, depth), np.broadcast_to(image.pixel_m(depth), depth.shape)
+    camera = np.linalg.inv(image.camera_from_world)
+    sight = np.broadcast_to(-camera[:3, 2], points.shape) if image.orthographic else (points - camera[:3, 3]) / depth[:, None]
+    reach = (TRUNCATION_SIGMAS + STEP_SIGMAS) * noise + TRUNCATION_VOXELS * voxel + STEEPEST * pixel
+    order = np.argsort(-reach, kind="stable")
+    points, sight, reach = points[order] - origin, sight[order], reach[order]
+    margin = MARGIN_VOXELS * voxel + 2 * pixel[order, None] + size / 4  # steps of half a box lie a quarter of one from each place
+    steps = np.ceil(reach / (size / 2)).astype(np.int64)
+    found = [np.zeros((0, 3), dtype=np.int64)]
+    for step in range(-steps.max(initial=0), steps.max(initial=-1) + 1):
+        some = slice(np.searchsorted(-steps, -abs(step), side="right"))
+        at = points[some] + np.clip(step * size / 2, -reach[some], reach[some])[:, None] * sight[some]
+        found.append(_boxes_between(*(np.floor((at + side * margin[some]) / size).astype(np.int64) for side in (-1, 1))))
+    return LEAST_VOXELS * np.unique(np.concatenate(found), axis=0)
+
+
+def _boxes_between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the boxes from lowest to highest ones, [n, 3] numbers each along the axes."""
+    base, count, beyond = low.min(axis=0), np.ptp(low, axis=0) + 1, (high - low).max(axis=0) + 1
+    numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *beyond))
+    ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *beyond)), axis=1)  # few, so that each is looked at alone
+    return np.concatenate([base + (ranges[:, :3] + corner)[(np.array(corner) <= ranges[:, 3:]).all(axis=1)]
+                           for corner in np.ndindex(*beyond)])
 
 
 def upload_layers(watching: list[Watching], device: str) -> tuple[Any, Any]:

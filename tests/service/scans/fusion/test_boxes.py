@@ -3,18 +3,21 @@
 import numpy as np
 import pytest
 
-from kernels.fusion.bricks import BLOCK, BRICK_VOXELS
-from kernels.fusion.views import RangeImage
+from kernels.device import to_numpy
+from kernels.fusion.bricks import BLOCK, BRICK, BRICK_VOXELS, find_blocks
+from kernels.fusion.views import RangeImage, upload_views
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest
 from service.scans.fusion import boxes
 from service.scans.fusion.fuse import fuse
 from service.scans.fusion.fused_bricks import fused_bricks
-from service.scans.fusion.range_images import PreparedScan, focal_of
+from service.scans.fusion.fused_surface import places_near
+from service.scans.fusion.range_images import PreparedScan, focal_of, prepare_scan
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import exponential
+from service.scans.points.scan import Scan
 from stage.capture.camera import Camera, Distortion
-from tests.scenes.statue import turntable, write_scans
+from tests.scenes.statue import shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
 VOXEL = 3e-3
@@ -120,3 +123,32 @@ def test_a_box_beside_a_camera_is_not_seen():
     assert boxes.watching_views([(0, scan)], np.array([4.0, -1.0, -0.5]), np.array([5.0, 1.0, 0.5])) == []
     (_, _, window), = boxes.watching_views([(0, scan)], np.array([-0.5, -0.5, -0.5]), np.array([0.5, 0.5, 0.5]))
     assert window == (0, SIZE[1], 0, SIZE[0])
+
+
+@pytest.mark.parametrize("parallel", [False, True], ids=["perspective", "orthographic"])
+def test_the_places_of_a_scan_hold_all_blocks_that_it_marks_whatever_its_noise(tmp_path, parallel):
+    """A pixel in fifty is a hundred times as noisy as the others, and one knows nothing: it alone reaches through the whole scene."""
+    rng = np.random.default_rng(0)
+    pose = turntable(1, (96, 72))[0].world_from_camera
+    shot = shoot_parallel(pose, (96, 72), 0.015) if parallel else shoot(pose, (96, 72), 130.0)
+    sigma = np.where(rng.random(shot.side) < 0.02, 100.0, 1.0) * 2e-4 * rng.lognormal(0, 0.5, shot.side)
+    sigma[tuple(np.argwhere(shot.mask)[1000])] = 50.0
+    camera = (Camera(projection="orthographic", resolution=(72, 96), pixel_size_m=0.015) if parallel else
+              Camera(projection="perspective", resolution=(72, 96), focal_px=(130.0, 130.0)))
+    cloud = camera.points(-shot.depth)[shot.mask]
+    scan = Scan(name="s", path=tmp_path, points=cloud.astype(np.float32), sigma=sigma[shot.mask].astype(np.float32),
+                sigma_source="measured", normals=None, normals_source="unknown", colours=None, confidence=None, origin=np.zeros(3),
+                camera=camera, pixels=np.flatnonzero(shot.mask), pose=pose, pose_covariance=None, maps=None)
+    prepared = prepare_scan(scan, tmp_path)
+    origin, voxel = np.array([0.011, -0.02, 0.007]), VOXEL
+    near = {tuple(place) for place in places_near(prepared, origin, voxel)}
+    views = upload_views([prepared.image], origin, device="cpu")
+    marked = set()
+    for brick in np.ndindex(4, 4, 4):
+        corner = BRICK_VOXELS * (np.array(brick) - 2)
+        found = find_blocks(views, voxel, tuple(int(x) for x in corner), BRICK, device="cpu")
+        at = corner + BLOCK * to_numpy(found.place)
+        marked |= {tuple(place) for place in boxes.LEAST_VOXELS * (at // boxes.LEAST_VOXELS)}
+    inside = {place for place in near if all(-2 * BRICK_VOXELS <= x < 2 * BRICK_VOXELS for x in place)}
+    assert len(marked) > 100 and marked <= near
+    assert len(inside) < 5 * len(marked)  # what a box of a margin holds beside a surface, on both sides: 3.2 and 3.5
