@@ -176,11 +176,14 @@ def _flipped(points: np.ndarray, triangles: np.ndarray, rim: int) -> np.ndarray:
     a, b, c = (triangles[edges.face, (edges.corner + k) % 3] for k in range(3))
     d = triangles[edges.other_face, (edges.other_corner + 2) % 3]
     angles = _angle(points, c, a, b) + _angle(points, d, a, b)
-    new, held = (np.minimum(one, other) * len(points) + np.maximum(one, other) for one, other in ((c, d), (a, b)))
+    held = np.minimum(a, b) * len(points) + np.maximum(a, b)
+    wide = np.flatnonzero((angles > np.pi * (1 + 1e-9)) & ((c >= rim) | (d >= rim)))
+    edges, a, b, c, d = _Edges(*(each[wide] for each in edges)), a[wide], b[wide], c[wide], d[wide]
+    new = np.minimum(c, d) * len(points) + np.maximum(c, d)
     one, other = (np.cross(points[second] - points[first], points[third] - points[first])
                   for first, second, third in ((a, d, c), (d, b, c)))
-    sound = ((c >= rim) | (d >= rim)) & ~np.isin(new, held) & (np.einsum("ei,ei->e", one, other) > 0)
-    chosen = _apart(edges, np.where(sound & (angles > np.pi * (1 + 1e-9)), angles, 0), len(triangles))
+    sound = ~np.isin(new, held) & (np.einsum("ei,ei->e", one, other) > 0)
+    chosen = _apart(edges, np.where(sound, angles[wide], 0), len(triangles))
     chosen = chosen[np.unique(new[chosen], return_index=True)[1]]
     turned = triangles.copy()
     turned[edges.face[chosen]] = np.stack([a, d, c], axis=1)[chosen]
