@@ -36,6 +36,9 @@ taken for translucent. Noise alone goes beyond it at one place in 370, which mak
 CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""
+FOLDED = 0.005, 0.33
+"""The same part, least and most, from which on single places are off because light bounces between folds: to either side, as folds open to
+both. Nothing is said of it, and sigma is wider in the squares around these places alone. Waves that are no sines lag everywhere."""
 WIDESPREAD_SIGMAS, WIDESPREAD = 2.0, 0.4
 """Lag in its standard deviations, and part of all pixels that have one beyond and are dimmed as much, from which on light runs below
 surfaces whatever the directions: noise makes one at a twentieth, and texture under a lens out of focus at a tenth."""
@@ -57,20 +60,21 @@ LAG_BYTES_PER_PIXEL = 2000
 
 
 class LagFinding(NamedTuple):
-    """The evidence of an axis for light below surfaces."""
+    """The evidence of an axis for light below surfaces, or between folds."""
 
     sigma: np.ndarray  # [rows, cols] float32, by how much places may be off, projector pixels
     usual_px: float
     """Median of the lag where it is clear."""
     share: float
-    """Part of the decoded pixels where it is clear."""
+    """Part of the decoded pixels where it is clear; 0: at too few, or to both sides."""
 
-    def sentence(self, axis: str) -> str:
+    def sentences(self, axis: str) -> list[str]:
         """Return what a user is told."""
-        return (f"frames[].pattern: {axis}s that different {axis} patterns show differ by {self.usual_px:.2g} px at "
-                f"{100 * self.share:.0f} % of the pixels, as where light bounces between folds or runs below the surface of translucent "
-                "things, or where frames hold part of the next pattern: the standard deviations hold about what that makes; cover "
-                "translucent things with matt paint or powder")
+        return [] if not self.share else [
+            f"frames[].pattern: {axis}s that different {axis} patterns show differ by {self.usual_px:.2g} px at "
+            f"{100 * self.share:.0f} % of the pixels, as where light bounces between folds or runs below the surface of translucent "
+            "things, or where frames hold part of the next pattern: the standard deviations hold about what that makes; cover "
+            "translucent things with matt paint or powder"]
 
 
 class Lags(NamedTuple):
@@ -85,6 +89,14 @@ class Lags(NamedTuple):
         """Return where the lag is larger than so many standard deviations, and not larger than light from nearby makes, [rows, cols] bool:
         what bounces off another surface shifts the edges of stripes, and dims wide and fine ones alike."""
         return (np.abs(self.size) > sigmas * self.deviation) & ~(np.abs(self.size) > self.most)
+
+    def single(self) -> np.ndarray:
+        """Return where places are clearly off by themselves, [rows, cols] bool."""
+        return self.beyond(CLEAR_SIGMAS) & (np.abs(self.size) > CLEAR_PX)
+
+    def single_part(self) -> float:
+        """Return their part of the decoded pixels."""
+        return float(self.single().sum() / max(np.isfinite(self.size).sum(), 1))
 
     def clear(self) -> tuple[float, float] | None:
         """Return the usual size of the lags that are clear, and their part of the decoded pixels; None where they show no light below
@@ -112,19 +124,21 @@ def widen_lagging(planes: Planes, coordinates: Coordinates, decoders: Sequence[A
             sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, found.sigma), 0)
             wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
             axis.sigma[:] = sigma
-            said.append(found.sentence(decoder.axis))
+            said += found.sentences(decoder.axis)
     return said, wider
 
 
 def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> LagFinding | None:
-    """Return by how much the decoded places of an axis may be off because light runs below surfaces; None where nothing shows it."""
+    """Return by how much the decoded places of an axis may be off because light runs below surfaces or bounces between folds; None
+    where nothing shows it."""
     measure = _measure_of(decoder.used, collected, noise)
     height = len(axis.coordinate)
     if measure is None or not axis.solved.any():
         return None
     tops = np.unique(np.linspace(0, max(height - AROUND, 0), STRIPS).astype(int))
     strips = [_lags(planes, axis, slice(top, min(top + AROUND, height)), measure) for top in tops]
-    if Lags(*(np.concatenate(values) for values in zip(*strips, strict=True))).clear() is None:
+    seen = Lags(*(np.concatenate(values) for values in zip(*strips, strict=True)))
+    if seen.clear() is None and seen.single_part() < FOLDED[0] / 2:
         return None
     lags = Lags(*(np.full_like(axis.coordinate, value) for value in UNKNOWN))
     for band in planes.bands(LAG_BYTES_PER_PIXEL):
@@ -133,10 +147,13 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
         for whole, part in zip(lags, _lags(planes, axis, around, measure), strict=True):
             whole[band] = part[inside]
     clear = lags.clear()
-    if clear is None:
+    if clear is not None:
+        beside = maximum_filter(lags.beyond(PROBABLE_SIGMAS), 2 * AROUND + 1)
+    elif FOLDED[0] <= lags.single_part() <= FOLDED[1]:
+        beside = maximum_filter(lags.single(), AROUND)
+    else:
         return None
-    beside = maximum_filter(lags.beyond(PROBABLE_SIGMAS), 2 * AROUND + 1)
-    return LagFinding(np.where(beside, lags.error, 0), *clear)
+    return LagFinding(np.where(beside, lags.error, 0), *(clear or (0.0, 0.0)))
 
 
 class _Measure(NamedTuple):
