@@ -9,6 +9,7 @@ from service.scans.points.cloud import Cloud
 from service.scans.points.neighbours import Neighbours
 from service.scans.points.rigid import applied, inverse
 from service.scans.points.scan import Scan
+from service.scans.registration.fine import TUKEY
 from stage.capture.camera import Camera
 
 MOST_PIXELS = 1 << 19
@@ -124,8 +125,9 @@ def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cl
                   ) -> Contradiction:
     """Return which parts of the points in sight lie where the other camera or scanner saw through, at a pose a_from_b.
 
-    On a part of the surface lie points whose neighbours are contradicted too, that are on no border and that the other camera does not see
-    edge-on: where a pixel takes in the edge of a surface and what is behind it, its point lies on neither.
+    A point is not contradicted by less than its own σ explains. On a part of the surface lie points whose neighbours are contradicted too,
+    that are on no border and that the other camera does not see edge-on: where a pixel takes in the edge of a surface and what is behind
+    it, its point lies on neither.
     """
     through = contradicted = in_sight = before_sets = on_sets = 0
     for image, own, cloud, way in ((a, cloud_a, cloud_b, pose), (b, cloud_b, cloud_a, inverse(pose))):
@@ -133,7 +135,7 @@ def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cl
             of_set = _seen_by_set(own, cloud.points[cloud.sample], way, tolerance)
             before_sets, on_sets = before_sets + of_set.contradicted, on_sets + of_set.agreeing
             continue
-        before, on, _ = _seen(image, cloud.points, way, tolerance)
+        before, on, _ = _seen(image, cloud.points, way, np.maximum(tolerance, TUKEY * cloud.sigma))
         at = np.flatnonzero(before & ~cloud.border)
         at = at[_facing(image, cloud.points[at], cloud.normals[at], way) > FACING]
         if len(at):
