@@ -138,7 +138,7 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
     tops = np.unique(np.linspace(0, max(height - AROUND, 0), STRIPS).astype(int))
     strips = [_lags(planes, axis, slice(top, min(top + AROUND, height)), measure) for top in tops]
     seen = Lags(*(np.concatenate(values) for values in zip(*strips, strict=True)))
-    if seen.clear() is None and seen.single_part() < FOLDED[0] / 2:
+    if seen.clear() is None and not (measure.between_waves and seen.single_part() >= FOLDED[0] / 2):
         return None
     lags = Lags(*(np.full_like(axis.coordinate, value) for value in UNKNOWN))
     for band in planes.bands(LAG_BYTES_PER_PIXEL):
@@ -149,7 +149,7 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
     clear = lags.clear()
     if clear is not None:
         beside = maximum_filter(lags.beyond(PROBABLE_SIGMAS), 2 * AROUND + 1)
-    elif FOLDED[0] <= lags.single_part() <= FOLDED[1]:
+    elif measure.between_waves and FOLDED[0] <= lags.single_part() <= FOLDED[1]:
         beside = maximum_filter(lags.single(), AROUND)
     else:
         return None
@@ -163,6 +163,8 @@ class _Measure(NamedTuple):
     """Returns the sums [sums, pixels] that are averaged over pixels, from readings [frames, pixels] and places [pixels]."""
     lag: Callable[[np.ndarray, np.ndarray], Lags]
     """Returns the lags, from these averages and the number of pixels in each."""
+    between_waves: bool
+    """Whether single places can tell it: edges of stripes lag as much beside periods counted wrongly, and on texture out of focus."""
 
 
 def _measure_of(used: Sequence[Code], collected: Collected, noise: NoiseModel) -> _Measure | None:
@@ -170,12 +172,13 @@ def _measure_of(used: Sequence[Code], collected: Collected, noise: NoiseModel) -
     if phase is None or len(phase.frames) < FULL_STEPS:
         return None
     if len(set(phase.periods_px)) > 1:
-        return _Measure(lambda grey, place: _wave_sums(grey, place, phase, noise), lambda means, count: _wave_lag(means, count, phase))
+        return _Measure(lambda grey, place: _wave_sums(grey, place, phase, noise), lambda means, count: _wave_lag(means, count, phase),
+                        between_waves=True)
     stripes = next((code for code in used if isinstance(code, BinaryCode) and code.name != "xor"), None)
     if stripes is None or (stripes.inverses is None and (collected.white is None or collected.black is None)):
         return None
     return _Measure(lambda grey, place: _edge_sums(grey, place, stripes, phase, collected),
-                    lambda means, count: _edge_lag(means, count, stripes, phase))
+                    lambda means, count: _edge_lag(means, count, stripes, phase), between_waves=False)
 
 
 def _lags(planes: Planes, axis: AxisMaps, rows: slice, measure: _Measure) -> Lags:
