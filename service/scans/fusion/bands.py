@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+from scipy.sparse import csr_array
 
 FINEST_PIXELS = 4.0
 """Shortest length of a band in pixels: below it a depth between pixels is a chord, and a normal of it says nothing."""
@@ -25,11 +26,18 @@ class Bands:
         """
         self._points, self._area = points, area
         self._facing = normals**2
-        self._side = np.where(normals < 0, 1, 0) + np.array([0, 2, 4])
+        self._side = (np.where(normals < 0, 1, 0) + np.array([0, 2, 4])).astype(np.int32)
         self._lengths = [FINEST_PIXELS * pixel_m * 2**k for k in range(BANDS)]
 
     def averaged(self, values: np.ndarray, length: float, counts: np.ndarray | None = None) -> np.ndarray:
         """Return values [V, k] averaged over about a length, metres; `counts` [V] is by how much each vertex counts, 0…1."""
+        mixed = self._mixed(length)
+        area = self._weights(counts)[:, None]
+        total = np.maximum(mixed.T @ area, np.finfo(np.float64).tiny)
+        return np.asarray(mixed @ (mixed.T @ (area * values) / total))
+
+    def _mixed(self, length: float) -> csr_array:
+        """Return the matrix [V, means] by which means over cells of a length mix at a vertex: eight cells, three sides of each."""
         local = self._points / length - 0.5
         low = np.floor(local).astype(np.int64)
         part = local - low
@@ -39,27 +47,11 @@ class Bands:
         corners = np.array(list(np.ndindex(2, 2, 2)))
         cells, own = np.unique(low @ strides, return_inverse=True)
         around, number = np.unique(cells[:, None] + corners @ strides, return_inverse=True)
-        number = number.reshape(len(cells), len(corners)) * 6
-        weights, places = [], []
-        for column, corner in enumerate(corners):
-            share = np.prod(np.where(corner, part, 1 - part), axis=1)
-            place = number[own.ravel(), column]
-            for axis in range(3):
-                weights.append(share * self._facing[:, axis])
-                places.append(place + self._side[:, axis])
-        count = 6 * len(around)
-        area = self._weights(counts)
-
-        def summed(given: np.ndarray) -> np.ndarray:
-            return np.sum([np.bincount(cells, weight * given, count) for cells, weight in zip(places, weights, strict=True)], axis=0)
-
-        total = np.maximum(summed(area), np.finfo(np.float64).tiny)
-        out = np.zeros_like(values)
-        for column in range(values.shape[1]):
-            mean = summed(area * values[:, column]) / total
-            for cells, weight in zip(places, weights, strict=True):
-                out[:, column] += weight * mean[cells]
-        return out
+        places = 6 * number.reshape(len(cells), 1, 8).astype(np.int32)[own.ravel()] + self._side[:, :, None]
+        along = [np.stack([1 - part[:, axis], part[:, axis]], axis=1) for axis in range(3)]
+        share = (along[0][:, :, None, None] * along[1][:, None, :, None] * along[2][:, None, None, :]).reshape(-1, 1, 8)
+        return csr_array(((share * self._facing[:, :, None]).ravel(), places.ravel(), np.arange(0, places.size + 1, 24)),
+                         shape=(len(part), 6 * len(around)))
 
     def of(self, values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
         """Return values [V, k] as a sum of bands, the finest first; `counts` [V] is by how much each vertex counts, 0…1."""
