@@ -60,7 +60,8 @@ class Broken(NamedTuple):
     """A surface that is broken where its normals say so."""
 
     height: wp.array  # [size] float32, in units of the spacing; parts that share an edge meet along it in the mean
-    part: np.ndarray  # [size] int, the part of each cell, -1 outside
+    fragment: np.ndarray  # [size] int, the fragment of each cell, -1 outside
+    part_of: np.ndarray  # [fragments] int, the part of each
     convergence: Convergence  # of the last solve
 
 
@@ -155,7 +156,7 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     lowered, noise, found, kept = breaks
     height = grid.zeros()
     if not len(found.first):
-        return Broken(height, found.label, solve(lowered, height, last=True))
+        return Broken(height, found.label, np.arange(found.count), solve(lowered, height, last=True))
     edges = (found.way, found.first)
     _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
     solve(lowered, height, last=False)
@@ -164,12 +165,12 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     height.zero_()  # the tolerance is relative to the first residual
     convergence = solve(lowered, height, last=True)
     heights = to_numpy(height)
-    added = np.append(assemble(found, parts, heights), 0.0).astype(np.float32)  # 0 for the label -1
+    added = np.append(assemble(found, parts, heights)[parts.of_fragment], 0.0).astype(np.float32)  # 0 for the label -1
     for first in range(0, len(heights), CELLS_AT_ONCE):
         cells = slice(first, first + CELLS_AT_ONCE)
-        heights[cells] += added[parts.label[cells]]
+        heights[cells] += added[parts.fragment[cells]]
     height.assign(heights)
-    return Broken(height, parts.label, convergence)
+    return Broken(height, parts.fragment, parts.of_fragment, convergence)
 
 
 def _set(weights: EdgeWeights, edges: tuple[np.ndarray, np.ndarray], values: np.ndarray) -> None:

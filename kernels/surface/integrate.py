@@ -38,8 +38,16 @@ class Integration(NamedTuple):
     iterations: int  # of conjugate gradients
     residual: float  # relative
     converged: bool
-    part: np.ndarray | None = None
-    """[rows, cols] int: pixels of one number are connected across no break, -1 outside. None: breaks were not looked for."""
+    fragment: np.ndarray | None = None
+    """[rows, cols] int: pixels of one number are connected across no abrupt turn of the normals, -1 outside. None: breaks were not looked
+    for."""
+    part_of: np.ndarray | None = None
+    """[fragments] int, the part of each fragment: fragments of one part meet along their outlines."""
+
+    @property
+    def part(self) -> np.ndarray | None:
+        """[rows, cols] int: pixels of one number are connected across no break, -1 outside. None: breaks were not looked for."""
+        return None if self.fragment is None or self.part_of is None else np.append(self.part_of, -1)[self.fragment]
 
 
 def integrate_normals(
@@ -102,23 +110,22 @@ def integrate_normals(
     if options.discontinuities:
         breaks = find_breaks(slopes, surface, grid=grid, spacing=spacing)
         del slopes, surface, x, y  # the solver needs the memory
-        h, part, done = integrate_broken(breaks, grid=grid, solve=improve)
+        h, fragment, part_of, done = integrate_broken(breaks, grid=grid, solve=improve)
+        fragment = grid.pixels(fragment)
         del breaks
     else:
-        h, part = grid.zeros(), None
+        h, fragment, part_of = grid.zeros(), None, None
         done = improve(slopes, h, last=True)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
-    if part is not None:
-        part = grid.pixels(part)
     if (rows, cols) != whole:
         inside, height = height, wp.zeros(whole, dtype=wp.float32, device=device)
         wp.copy(height[box], inside)
-        inner, part = part, None if part is None else np.full(whole, -1, dtype=part.dtype)
-        if part is not None:
-            part[box] = inner
+        inner, fragment = fragment, None if fragment is None else np.full(whole, -1, dtype=fragment.dtype)
+        if fragment is not None:
+            fragment[box] = inner
     if progress is not None:
         progress(1.0)
-    return Integration(height, runs.count, done.iterations, done.residual, done.converged, part)
+    return Integration(height, runs.count, done.iterations, done.residual, done.converged, fragment, part_of)
 
 
 def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -> None:

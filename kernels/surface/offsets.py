@@ -59,6 +59,7 @@ class PartShadows(NamedTuple):
     highest: wp.array  # [pixels, lights] float32: largest height of the surface above the ray, over all of it that moves against the pixel
     lowest: wp.array  # [pixels, lights] float32: the least
     back: wp.array  # [pixels, lights] float32: least height of the guessed back above the ray
+    opening: wp.array  # [pixels, lights] vec2: gaps, between the lowest and the highest, at which the ray passes through a hole; 0, 0: none
     hidden: wp.array  # [pixels, lights] uint8: whether surface that moves with the pixel hides the light, whatever the offset; 0 where the
     # path passes by the part that moves
 
@@ -80,6 +81,26 @@ def _passes_by(start: wp.vec3, way: wp.vec3, camera: Camera, u: float, v: float,
     return left < wp.max(entered, 0.0)
 
 
+@wp.func
+def _with_run(gaps: wp.vec4, low: float, high: float) -> wp.vec4:
+    """Return the lowest and the highest gap on a path, and the widest opening between them, with those of one more run over the surface:
+    between two runs a ray that passes behind the one and before the other meets nothing."""
+    if gaps[1] == NO_GAP:
+        return wp.vec4(low, high, 0.0, 0.0)
+    one = wp.vec2(gaps[2], wp.clamp(low, gaps[2], gaps[3]))  # what the run leaves of the opening so far
+    other = wp.vec2(wp.clamp(high, gaps[2], gaps[3]), gaps[3])
+    beyond = wp.vec2(wp.min(gaps[1], low), low)  # above all runs, or below
+    beneath = wp.vec2(high, wp.max(gaps[0], high))
+    widest = one
+    if other[1] - other[0] > widest[1] - widest[0]:
+        widest = other
+    if beyond[1] - beyond[0] > widest[1] - widest[0] and low > gaps[1]:
+        widest = beyond
+    if beneath[1] - beneath[0] > widest[1] - widest[0]:
+        widest = beneath
+    return wp.vec4(wp.min(gaps[0], low), wp.max(gaps[1], high), widest[0], widest[1])
+
+
 @wp.kernel
 def _march(first: int,
            pixels: wp.array(dtype=wp.vec2i),
@@ -94,6 +115,7 @@ def _march(first: int,
            highest: wp.array2d(dtype=float),
            lowest: wp.array2d(dtype=float),
            back: wp.array2d(dtype=float),
+           opening: wp.array2d(dtype=wp.vec2),
            hidden: wp.array2d(dtype=wp.uint8)):
     n = first + wp.tid()
     row, col = pixels[n][0], pixels[n][1]
@@ -107,7 +129,8 @@ def _march(first: int,
         across = wp.sqrt(way[0] * way[0] + way[1] * way[1])
         stride = pixel / wp.max(across, 1.0e-4)
         travelled = FIRST_STEP * stride
-        top, bottom, rear = float(NO_GAP), float(-NO_GAP), float(-NO_GAP)  # literals could not change inside the loop
+        gaps = wp.vec4(-NO_GAP, NO_GAP, 0.0, 0.0)  # the lowest, the highest, and the opening between them
+        top, bottom, rear = float(NO_GAP), float(-NO_GAP), float(-NO_GAP)  # of this run; literals could not change inside the loop
         own = wp.uint8(0)
         crossed, last = wp.int32(0), wp.int32(-1)  # pixels on the way of the part that is crossed, and that part
         before, sooner, soonest, flat = float(0.0), float(0.0), float(0.0), bool(False)  # the last gaps to it, and whether it is flat
@@ -126,6 +149,9 @@ def _march(first: int,
                 top, bottom = wp.max(top, rim), wp.min(bottom, rim)
             if here != last or (here == moving) == moves:
                 crossed = 0
+            if top > NO_GAP and (here < 0 or (here == moving) == moves):
+                gaps = _with_run(gaps, bottom, top)
+                top, bottom = float(NO_GAP), float(-NO_GAP)
             last = here
             if here >= 0:
                 # between pixels where all four are of one part: the largest of many gaps at the nearest pixels would be too large
@@ -152,9 +178,12 @@ def _march(first: int,
                     before = gap
                     crossed += 1
             travelled += stride
-        highest[n, light] = top
-        lowest[n, light] = bottom
-        back[n, light] = wp.min(rear, bottom)
+        if top > NO_GAP:
+            gaps = _with_run(gaps, bottom, top)
+        highest[n, light] = gaps[1]
+        lowest[n, light] = gaps[0]
+        back[n, light] = wp.min(rear, gaps[0])
+        opening[n, light] = wp.vec2(gaps[2], gaps[3])
         hidden[n, light] = own
 
 
@@ -175,7 +204,7 @@ def march_part(
     if not height.shape == part.shape == thickness.shape:
         raise ArrayError(f"height is {height.shape}, part {part.shape}, thickness {thickness.shape}: give one of each for every pixel")
     shape, device = (pixels.shape[0], toward.shape[0]), height.device.alias
-    found = PartShadows(*(wp.empty(shape, dtype=float, device=device) for _ in range(3)), wp.empty(shape, dtype=wp.uint8, device=device))
+    found = PartShadows(*(wp.empty(shape, dtype=kind, device=device) for kind in (float, float, float, wp.vec2, wp.uint8)))
     inputs = [pixels, toward, height, part, thickness, moving, box, projection.on_device()]
     devices.launch(_march, shape[0], inputs, list(found), device=device, uneven=True)
     return found
@@ -237,12 +266,16 @@ def weigh_offsets(
     # go the other way round
     flat = gaps[1] - gaps[2] < FLAT * blur  # as a plate: the readings choose whether light passes behind it
     places = [_bin(np.where(mine, gap, -gap), reach) for gap in gaps]
+    low, high = to_numpy(shadows.opening)[told].T
+    opens, closes = (_bin(np.where(mine, own, -other), reach) for own, other in ((low, high), (high, low)))
 
     def along(levels: list[np.ndarray]) -> np.ndarray:
         change = np.zeros((GROUPS, 2 * STEPS + 2))
         np.add.at(change, (whose, np.zeros_like(whose)), np.where(mine, levels[-1], levels[0]))
         for place, before, after in zip(places, levels[:-1], levels[1:], strict=True):
             np.add.at(change, (whose, place), np.where(mine, before - after, after - before))
+        for place, sign in ((opens, 1), (closes, -1)):
+            np.add.at(change, (whose, place), sign * (levels[-1] - levels[1]))
         return _blurred(np.cumsum(change, axis=1)[:, :-1], blur / reach * STEPS)
 
     tried = [(0.0, 1.0, INSIDE, np.where(flat, behind, BEHIND)) for behind in (BEHIND, BEHIND_PLATE)]
@@ -251,7 +284,8 @@ def weigh_offsets(
     best = int(np.argmax(gain.sum(axis=0)))
     passed = np.sum([place <= best for place in places], axis=0)
     sure = 1 / (1 + np.exp(-np.abs(odds[told])))  # probability that a reading's odds have the sign of its state
-    dark = 1 - sure + np.choose(np.where(mine, 3 - passed, passed), states) * (2 * sure - 1)
+    state = np.where((opens <= best) & (best < closes), 3, np.where(mine, 3 - passed, passed))
+    dark = 1 - sure + np.choose(state, states) * (2 * sure - 1)
     mean = along([dark * np.log(1 + state * np.expm1(np.abs(odds[told]))) + (1 - dark) * np.log(1 + state * np.expm1(-np.abs(odds[told])))
                   for state in states])
     return Evidence(np.linspace(-reach, reach, 2 * STEPS + 1), gain - gain[:, STEPS, None], mean[:, best, None] - mean)

@@ -41,13 +41,14 @@ ROUNDS = 8
 class Parts(NamedTuple):
     """The parts, and the edges between them."""
 
-    label: np.ndarray  # [size] int, the part of each cell; -1 outside
+    fragment: np.ndarray  # [size] int, the fragment of each cell, -1 outside: that of `Fragments`, with the small ones and strips joined
+    of_fragment: np.ndarray  # [fragments] int, the part that each belongs to
     count: int
     between: np.ndarray  # [E] bool, whether this cut edge of the fragments leads from part to part
 
 
 def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
-    """Connect fragments that belong together; their labels become those of the parts.
+    """Connect fragments that belong together; those under LEAST_PART pixels and strips along outlines lose their labels.
     `height`: [size] heights in units of the spacing, integrated without the cut edges: each fragment has a constant of its own. `noise`:
     standard deviation of the sum of slopes around four pixels."""
     seam = _Seam(found, height)
@@ -57,15 +58,16 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
     for _ in range(ROUNDS):
         if not _absorb(seam, _slivers(seam)):
             break
+    kept, fragment = np.unique(seam.group, return_inverse=True)
+    relabel(found.label, np.append(fragment, -1).astype(np.int32))
     play = PLAY_PIXELS + PLAY_JUMP * found.jump + PLAY_NOISE * noise
     for one, other in seam.pairs():
         low, high = sorted((int(seam.group[one]), int(seam.group[other])), key=lambda group: int(seam.size[group]))
         if low != high:
             _join_meeting(seam, low, high, play)
     first, second = seam.sides()
-    kept, number = np.unique(seam.group, return_inverse=True)
-    relabel(found.label, np.append(number, -1).astype(np.int32))
-    return Parts(found.label, len(kept), first != second)
+    groups, part = np.unique(seam.group, return_inverse=True)
+    return Parts(found.label, part[kept], len(groups), first != second)
 
 
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
@@ -74,7 +76,7 @@ def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
     `height` is [size] heights of the parts, each with a constant of its own, in units of the spacing.
     """
     edges = np.flatnonzero(parts.between)
-    first, second = parts.label[found.first[edges]], parts.label[found.second[edges]]
+    first, second = (parts.of_fragment[parts.fragment[cells[edges]]] for cells in (found.first, found.second))
     weight = found.weight[edges] / (1 + found.jump[edges] ** 2)
     step = height[found.second[edges]] - height[found.first[edges]] - found.slope[edges]
     matrix, right = np.eye(parts.count) * LEAST_PULL * max(weight.sum(), 1.0), np.zeros(parts.count)

@@ -1,6 +1,7 @@
 """Solve a capture: images → normals, reflectance and height, in maps.exr and report.json."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,10 +121,9 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else to_numpy(solution.integration.height)
-    placement = place_solution(given, opened.lights, solution) if isinstance(opened.lights, DistantLights) else None
-    if placement is not None:
-        solution.height = placement.height
-        solution.warnings += placement.warnings()
+    placement = None
+    if isinstance(opened.lights, DistantLights):
+        placement = place_solution(given, opened.lights, solution, partial(integrate, given, solution.normal, estimated, sigma=sigma))
     if solution.shared_misfit is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)
     if request.materials is Materials.COHERENT:

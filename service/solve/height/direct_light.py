@@ -4,6 +4,7 @@ From the first normals follows a height, from the height which readings lie in c
 that the object throws on itself.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from kernels.surface.shadows import Extent, extent_of
 from service.solve.base.solution import SolveInput
 from service.solve.height.height import integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
-from service.solve.height.parts import Material, numbered, place_parts
+from service.solve.height.part_scene import Material
+from service.solve.height.parts import numbered, place_parts
 from stage.colour.colour import GREY_WEIGHTS
 
 LARGEST_ALBEDO = 0.98
@@ -85,14 +87,16 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     """Find what the object does to its own light, or return None when no pixel is solved.
     `normal`: [3, pixels] float32, found so far. `bouncing`: [3, pixels] albedo of the light that other surfaces send. `parts`: whether
     parts are moved in depth to where their shadows agree with the images; not under near lights."""
-    surface = integrate(given, normal, solved, stage="surface")
+    whole = partial(integrate, given, normal, solved, stage="surface")
+    surface = whole()
     if surface is None:
         return None
     height = surface.height
-    if parts and field is None and surface.part is not None:
-        placed = place_parts(given, lights, normal, material, to_numpy(height), surface.part)
+    if parts and field is None:
+        surface, placed = place_parts(given, lights, normal, material, surface, whole)
         height = wp.array(placed.height, dtype=float, device=given.device)
     arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
-    mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
+    part = surface.part
+    mask = solved.astype(np.uint8) if part is None else numbered(part)
     on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
     return DirectLight(given, lights, field, on_device, height, extent_of(to_numpy(height), mask), shadows, arriving, bouncing)

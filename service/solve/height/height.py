@@ -23,12 +23,13 @@ RINGS = 8
 
 
 def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigma: np.ndarray | None = None,
-              stage: str = "height") -> Integration | None:
+              cuts: tuple[np.ndarray, np.ndarray] | None = None, stage: str = "height") -> Integration | None:
     """Integrate the normals of the solved pixels.
 
     Args:
         normal: [3, pixels] float32.
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
+        cuts: edges to the right, and edges down, that the surface breaks along besides, [rows, cols] bool each.
         stage: what the progress calls this work.
 
     Returns:
@@ -40,7 +41,7 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     camera = given.camera
     return integrate_normals(normal.reshape(3, *solved.shape), solved, *camera.plane_views(),
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
-                             sigma=None if sigma is None else sigma.reshape(solved.shape), options=OPTIONS,
+                             sigma=None if sigma is None else sigma.reshape(solved.shape), cuts=cuts, options=OPTIONS,
                              device=given.device, progress=given.timings.advance_percent)
 
 

@@ -35,7 +35,7 @@ from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
-from service.solve.height.parts import Material
+from service.solve.height.part_scene import Material
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.settling import as_shown, middles_of, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes

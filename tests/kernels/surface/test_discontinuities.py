@@ -81,7 +81,9 @@ def test_a_crease_is_no_break(degrees, slope, device):
     across = x * np.cos(turn) + y * np.sin(turn)
     shape = shapes.from_gradient(x, y, -slope * np.abs(across), *(-slope * np.sign(across) * side for side in (np.cos(turn), np.sin(turn))))
     found = solve(shape, device, discontinuities=True)
-    assert len(parts_of(found)) == 1
+    assert len(parts_of(found)) == 1 and found.part_of.tolist() == [0, 0]
+    sides = np.bincount(found.fragment[found.fragment >= 0], across[found.fragment >= 0] > 0)
+    assert np.sort(sides / np.bincount(found.fragment[found.fragment >= 0])) == pytest.approx([0, 1], abs=0.05)
     assert worst(found, shape) * np.ptp(shape.z) < 0.5 * slope
 
 

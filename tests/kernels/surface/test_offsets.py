@@ -16,10 +16,11 @@ THICK = 3.0
 """Guessed thickness."""
 
 
-def block(rise=RISE):
-    """A floor and a block before it, [rows, cols] heights and parts."""
+def block(rise=RISE, hole=False):
+    """A floor and a block before it, or one with a hole, [rows, cols] heights and parts."""
     part = np.zeros((SIDE, SIDE), np.int32)
     part[14:24, 16:28] = 1
+    part[17:21, 19:25] = 0 if hole else 1
     return np.where(part == 1, rise, 0).astype(np.float32), part
 
 
@@ -57,28 +58,62 @@ def test_paths_that_pass_by_the_part_are_not_followed(perspective, device):
     np.testing.assert_array_equal(short.hidden.numpy()[met], long.hidden.numpy()[met])
 
 
+@pytest.mark.parametrize("hole", [False, True])
 @pytest.mark.parametrize("perspective", [False, True])
-def test_one_march_tells_the_shadows_at_every_offset(perspective, device):
+def test_one_march_tells_the_shadows_at_every_offset(perspective, hole, device):
     """Shadows of a block that stands anywhere before the floor, marched once where it lies, against a march where it was moved to.
 
     In perspective it moves by growing about the eye. Tolerance: where a gap is within a hundredth of a pixel of the ray, rounding decides.
     """
     far = 400.0
-    height, part = block()
+    height, part = block(hole=hole)
     if perspective:
         height = height - far
     found = march(height, part, device, perspective, far)[1]
+    open_to = found.opening.numpy().astype(np.float64)
+    assert (np.ptp(open_to, axis=2) > 0.5 / (far if perspective else 1)).any() == hole
     assert not found.hidden.numpy().any()  # neither the floor nor the block hides a light from itself
     on = (part.reshape(-1) == 1)[:, None]
     for offset in (-4.0, 3.0, 20.0):
         told = -np.log((far - offset) / far) if perspective else offset
         moved = np.where(part == 1, height * np.exp(-told) if perspective else height + offset, height).astype(np.float32)
-        for here, there in zip(found[:3], march(moved, part, device, perspective, far)[1][:3], strict=True):
+        again = march(moved, part, device, perspective, far)[1]
+        wide = np.ptp(open_to, axis=2) > 0
+        np.testing.assert_array_equal(wide, np.ptp(again.opening.numpy(), axis=2) > 0)
+        shift = np.broadcast_to(np.where(on, -told, told), wide.shape)[wide][:, None]
+        assert np.abs(open_to[wide] + shift - again.opening.numpy()[wide]).max(initial=0) < (2e-5 if perspective else 1e-3)
+        for here, there in zip(found[:3], again[:3], strict=True):
             here, there = here.numpy(), there.numpy()
             met = np.abs(there) < 1e29
             assert np.array_equal(met, np.abs(here) < 1e29)
             expected = here + np.where(on, -told, told)
             assert np.abs(expected - there)[met].max() < (2e-5 if perspective else 1e-3)
+
+
+def test_light_passes_through_a_hole(device):
+    """A plate with a hole before a floor: each ray meets the plate where it crosses its plane, or passes through the hole or beside it.
+
+    Tolerance: rays that cross the plane within .8 of a pixel of an edge are not judged, since the march looks at nearest pixels there.
+    """
+    height, part = block(hole=True)
+    pixels, found = march(height, part, device, thick=0.0)
+    low, high = (values.numpy() for values in (found.lowest, found.highest))
+    opening = found.opening.numpy()
+    toward, floor = lights().astype(np.float64), part[tuple(pixels.T)] == 0
+    plate = part == 1
+    sure, through = 0, 0
+    for offset in (-3.0, 0.0, 6.0):
+        hidden = (low + offset < 0) & (high + offset > 0) & ~((opening[..., 0] + offset < 0) & (opening[..., 1] + offset > 0))
+        along = (RISE + offset) / toward[:, 2]
+        col, row = pixels[:, 1, None] + along * toward[:, 0], pixels[:, 0, None] - along * toward[:, 1]
+        inside = (row > 1) & (row < SIDE - 2) & (col > 1) & (col < SIDE - 2) & floor[:, None]
+        met = [plate[np.clip(np.rint(row + down), 0, SIDE - 1).astype(int), np.clip(np.rint(col + right), 0, SIDE - 1).astype(int)]
+               for down in (-0.8, 0, 0.8) for right in (-0.8, 0, 0.8)]
+        judged = inside & (np.all(met, axis=0) | ~np.any(met, axis=0))
+        np.testing.assert_array_equal(hidden[judged], met[4][judged])
+        sure += judged.sum()
+        through += (judged & (low + offset < 0) & (high + offset > 0) & ~hidden).sum()
+    assert through > 100 and sure > 1000
 
 
 def test_the_march_refuses_parts_of_another_shape(device):

@@ -108,7 +108,7 @@ def test_no_part_is_placed_by_the_shadows_of_one_that_has_no_place(slope, tmp_pa
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "hole"])  # a disc with a hole may be joined to the body without a word
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [11, 12])
 def test_steps_of_random_layouts_are_right_within_their_sigma(kind, seed, tmp_path):
     """Two layouts of each kind that nothing was chosen on.
@@ -126,6 +126,20 @@ def test_steps_of_random_layouts_are_right_within_their_sigma(kind, seed, tmp_pa
             assert abs(step) < min(2.4 / 80, 2 * placed["sigma"])
         else:
             assert placed["status"] == "unknown" and kind != "ball"
+
+
+def test_shadows_part_what_meets_all_along_its_outline(tmp_path):
+    """A disc with a hole, 50 pixels before a body: one shift makes it meet the body along three quarters of its two outlines.
+
+    It was joined to the body without a word. Tolerance: two pixels of 1/58 of the size, and two σ.
+    """
+    shot = random_layout("hole", 40).shoot(side=96, seed=40)
+    maps, report = solved(shot, tmp_path)
+    disc = report["parts"][int(np.bincount(maps.part[shot.part == 0]).argmax()) - 1]
+    assert disc["status"] == "known" and abs(disc["pixels"] - (shot.part == 0).sum()) < 0.05 * disc["pixels"]
+    error = maps.height - shot.z
+    step = abs(np.median(error[shot.part == 0]) - np.median(error[shot.part == 1]))
+    assert step < 0.05 and step < 2 * disc["sigma"]
 
 
 def test_an_object_without_a_break_has_no_parts(tmp_path):

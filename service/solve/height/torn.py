@@ -1,0 +1,66 @@
+"""Fragments of a surface that meet along their outlines and yet stand apart, as the shadows in the images say.
+
+Normals join two fragments where one shift makes them meet along most of their outlines (kernels/surface/parts.py). A flat ring before a
+body may do so though it stands far before it. Each fragment that was joined to a larger one is moved alone along the line of sight: where
+the shadows place it elsewhere, beyond doubt, the surface is cut around it and integrated again.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from kernels.device import to_numpy
+from kernels.photometric.lambertian.readings import Lights
+from kernels.surface.integrate import Integration
+from kernels.surface.offsets import Offset
+from service.solve.base.solution import SolveInput
+from service.solve.height.part_scene import LEAST_SHARE, MOST_PARTS, Material, PartScene
+
+APART_SIGMAS = 3.0
+"""Distance, in its σ, at which shadows place a fragment from where it was joined, from which on it is cut off."""
+
+class Again(Protocol):
+    """Integrates the normals again."""
+
+    def __call__(self, *, cuts: tuple[np.ndarray, np.ndarray]) -> Integration | None:
+        """Break the surface along some edges to the right, and some down, too, [rows, cols] bool each."""
+
+
+def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, surface: Integration,
+         again: Again) -> tuple[Integration, np.ndarray]:
+    """Return a surface with the fragments apart that shadows part, and its height [rows, cols] float32.
+    `normal`: [3, pixels] float32."""
+    height, fragment, part_of = to_numpy(surface.height), surface.fragment, surface.part_of
+    assert fragment is not None and part_of is not None
+    size = np.bincount(fragment[fragment >= 0], minlength=len(part_of))
+    largest_first = np.argsort(-size, kind="stable")
+    host = np.zeros(len(part_of), dtype=int)
+    host[part_of[largest_first[::-1]]] = largest_first[::-1]
+    judged = [int(number) for number in largest_first if host[part_of[number]] != number and size[number] >= LEAST_SHARE * size.sum()]
+    if not judged:
+        return surface, height
+    scene = PartScene(given, lights, normal, material, height, fragment)
+    apart: dict[int, Offset] = {}
+    main = int(np.argmax(np.bincount(part_of, weights=size)))
+    for number in judged[:MOST_PARTS]:
+        others = np.flatnonzero((part_of == main) | (part_of == part_of[number]))
+        step = scene.step_of(number, against=[int(other) for other in others if other != number])
+        if scene.is_known(step.low, step.high) and abs(step.offset) > APART_SIGMAS * step.sigma:
+            apart[number] = step
+    if not apart:
+        return surface, height
+    out = np.isin(fragment, list(apart))
+    cuts = np.zeros(fragment.shape, dtype=bool), np.zeros(fragment.shape, dtype=bool)
+    cuts[0][:, :-1] = out[:, 1:] != out[:, :-1]
+    cuts[1][:-1] = out[1:] != out[:-1]
+    found = again(cuts=cuts)
+    assert found is not None and found.part is not None
+    part, moved = found.part, to_numpy(found.height).copy()
+    for each in np.unique(part[np.isin(fragment, np.flatnonzero(np.isin(part_of, part_of[list(apart)])))]):
+        mine = part == each
+        number = int(np.bincount(fragment[mine]).argmax())
+        behind = fragment == host[part_of[number]]
+        # what was joined through a fragment that is apart stays where it was
+        before, after = (scene.level(z, mine) - scene.level(z, behind) for z in (height, moved))
+        scene.shift(moved, mine, before - after + (apart[number].offset if number in apart else 0.0))
+    return found, moved
