@@ -91,11 +91,12 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
 
 @wp.func
 def tilt_variance(m00: float, m01: float, m02: float, m11: float, m12: float, m22: float):
-    """Return the sum of the first two diagonal elements of the inverse of a symmetric 3 × 3 matrix; OPEN where it has none."""
+    """Return the sum of the first two diagonal elements of the inverse of a symmetric 3 × 3 matrix; OPEN where it is not positive."""
     c00 = m11 * m22 - m12 * m12
+    c11 = m00 * m22 - m02 * m02
     bottom = m00 * c00 + m01 * (m02 * m12 - m01 * m22) + m02 * (m01 * m12 - m02 * m11)
-    sound = m00 > 0.0 and m11 > 0.0 and m22 > 0.0 and bottom > 1.0e-6 * m00 * m11 * m22
-    return wp.where(sound, (c00 + m00 * m22 - m02 * m02) / wp.max(bottom, 1.0e-30), OPEN)
+    sound = m22 > 0.0 and c00 > 0.0 and c11 > 0.0 and bottom > 1.0e-6 * m00 * m11 * m22
+    return wp.where(sound, (c00 + c11) / wp.max(bottom, 1.0e-30), OPEN)
 
 
 @once

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 from kernels.photometric.material.material import fit_tinted
 from kernels.photometric.search.hypotheses import Diffuse
 from kernels.photometric.search.light_factors import find_light_factors
-from kernels.photometric.search.refine import refine
+from kernels.photometric.search.refine import OPEN, refine, tilt_variance
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import LIGHTS, VIEW, degrees, render, sample, tilted
 from tests.reference import microfacet as twin
@@ -123,3 +124,26 @@ def test_half_an_object_cannot_be_left_out(device):
     """All pixels lie in one square, so that none are left to ask."""
     samples, _ = sample(render(NORMAL, f0=None) * jitter(0.1)[:, None], device)
     assert not find_light_factors(samples, NORMAL, LIGHTS, 0 * ROW, 0 * COL, shape=Diffuse()).believed
+
+
+def test_a_curvature_that_is_not_positive_leaves_the_normal_open(device):
+    """Products of float32 may leave two falling directions, whose determinant is positive too: σ was the root of a negative number.
+
+    Tolerance: float32 rounding of a determinant that is as small as a thousandth of the diagonal's product.
+    """
+    rng = np.random.default_rng(0)
+    turns = np.linalg.qr(rng.normal(size=(3000, 3, 3)))[0]
+    values = rng.uniform(0.2, 2, (3000, 3)) * np.where(np.arange(3000)[:, None] % 2, 1, rng.choice([-1, 1], (3000, 3)))
+    given = ((turns * values[:, None]) @ np.swapaxes(turns, 1, 2)).astype(np.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate(m: wp.array3d(dtype=float), out: wp.array(dtype=float)):
+        i = wp.tid()
+        out[i] = tilt_variance(m[i, 0, 0], m[i, 0, 1], m[i, 0, 2], m[i, 1, 1], m[i, 1, 2], m[i, 2, 2])
+
+    out = wp.zeros(3000, dtype=float, device=device)
+    wp.launch(evaluate, dim=3000, inputs=[wp.array(given, dtype=float, device=device)], outputs=[out], device=device)
+    positive = (values > 0).all(axis=1)
+    assert (np.diagonal(given, axis1=1, axis2=2) > 0).all(axis=1)[~positive].sum() > 50
+    expected = np.where(positive, np.linalg.inv(given.astype(np.float64))[:, [0, 1], [0, 1]].sum(axis=1), OPEN)
+    np.testing.assert_allclose(out.numpy(), expected, rtol=1e-4)
