@@ -93,7 +93,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         return None
     height = surface.height
     if parts and field is None:
-        surface, placed = place_parts(given, lights, normal, material, surface, whole)
+        surface, placed = place_parts(given, lights, normal, material, surface, to_numpy(height), whole)
         height = wp.array(placed.height, dtype=float, device=given.device)
     arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
     part = surface.part

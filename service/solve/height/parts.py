@@ -86,10 +86,10 @@ class Placement(NamedTuple):
 
 
 def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, surface: Integration,
-                again: Again) -> tuple[Integration, Placement]:
+                height: np.ndarray, again: Again) -> tuple[Integration, Placement]:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images; return the surface too, of which
-    shadows may have parted what normals joined. `normal`: [3, pixels] float32."""
-    surface, height = tear(given, lights, normal, material, surface, again)
+    shadows may have parted what normals joined. `normal`: [3, pixels] float32. `height`: [rows, cols] float32, that of the surface."""
+    surface, height = tear(given, lights, normal, material, surface, height, again)
     part = surface.part
     assert part is not None
     size = np.bincount(part[part >= 0])
@@ -130,12 +130,13 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
 
 def place_solution(given: SolveInput, lights: DistantLights, solution: Solution, again: Again) -> Placement | None:
     """Place the parts of a solution in depth and say so in it; None where it has no height or no parts."""
-    if solution.integration is None or solution.integration.fragment is None:
+    if solution.integration is None or solution.height is None or solution.integration.fragment is None:
         return None
     given.timings.stage("parts", 1)
     padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
     material = Material(solution.albedo, solution.specular, solution.roughness)
-    solution.integration, placement = place_parts(given, padded, solution.normal, material, solution.integration, again)
+    solution.integration, placement = place_parts(given, padded, solution.normal, material, solution.integration, solution.height,
+                                                  again)
     solution.height = placement.height
     solution.warnings += placement.warnings()
     return placement

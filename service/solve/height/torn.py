@@ -27,10 +27,10 @@ class Again(Protocol):
 
 
 def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, surface: Integration,
-         again: Again) -> tuple[Integration, np.ndarray]:
+         height: np.ndarray, again: Again) -> tuple[Integration, np.ndarray]:
     """Return a surface with the fragments apart that shadows part, and its height [rows, cols] float32.
-    `normal`: [3, pixels] float32."""
-    height, fragment, part_of = to_numpy(surface.height), surface.fragment, surface.part_of
+    `normal`: [3, pixels] float32. `height`: [rows, cols] float32, that of the surface."""
+    fragment, part_of = surface.fragment, surface.part_of
     assert fragment is not None and part_of is not None
     size = np.bincount(fragment[fragment >= 0], minlength=len(part_of))
     largest_first = np.argsort(-size, kind="stable")
