@@ -83,18 +83,18 @@ def _passes_by(start: wp.vec3, way: wp.vec3, camera: Camera, u: float, v: float,
 
 @wp.func
 def _with_run(gaps: wp.vec4, low: float, high: float) -> wp.vec4:
-    """Return the lowest and the highest gap on a path, and the widest opening between them, with those of one more run over the surface:
-    between two runs a ray that passes behind the one and before the other meets nothing."""
+    """Return the lowest and the highest gap on a path, and the ends of the widest opening between them, with those of one more run over the
+    surface: a ray that passes behind one run and before another passes through a hole, or beside an arm, and meets nothing."""
     if gaps[1] == NO_GAP:
         return wp.vec4(low, high, 0.0, 0.0)
     one = wp.vec2(gaps[2], wp.clamp(low, gaps[2], gaps[3]))  # what the run leaves of the opening so far
     other = wp.vec2(wp.clamp(high, gaps[2], gaps[3]), gaps[3])
-    beyond = wp.vec2(wp.min(gaps[1], low), low)  # above all runs, or below
-    beneath = wp.vec2(high, wp.max(gaps[0], high))
+    beyond = wp.vec2(wp.min(gaps[1], low), low)  # between the runs so far and this one, which lies above them all
+    beneath = wp.vec2(high, wp.max(gaps[0], high))  # or below
     widest = one
     if other[1] - other[0] > widest[1] - widest[0]:
         widest = other
-    if beyond[1] - beyond[0] > widest[1] - widest[0] and low > gaps[1]:
+    if beyond[1] - beyond[0] > widest[1] - widest[0]:
         widest = beyond
     if beneath[1] - beneath[0] > widest[1] - widest[0]:
         widest = beneath
