@@ -145,6 +145,19 @@ def test_shadows_part_what_meets_all_along_its_outline(tmp_path):
     assert step < 0.05 and step < 2 * disc["sigma"]
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("method", "lights", "noise"), [(Method.ROBUST, 12, 0.01), (Method.ROBUST, 48, 0.03), (Method.SVBRDF, 48, 0.03)])
+@pytest.mark.parametrize("walls", [2, 4])
+def test_shadows_leave_together_what_meets_at_creases(walls, method, lights, noise, tmp_path):
+    """A valley, and a pit of four walls, which throw shadows on each other: each wall is a fragment, and they are one part."""
+    turn = 0.3 + 2 * np.pi * np.arange(walls) / walls
+    across = np.stack([0.7 * np.cos(turn), 0.7 * np.sin(turn), np.ones(walls)], axis=1) / np.hypot(0.7, 1)
+    parts = [Part((0.0, 0.0, 0.0), (1e9,) * 3, normal=tuple(normal)) for normal in across]
+    shot = shoot(parts, sphere_lights(lights, least_z=0.1), side=SIDE, across=2.2, inside=1.0, noise=noise)
+    maps, report = solved(shot, tmp_path, method)
+    assert maps.part is None and report["parts"] == []
+
+
 def test_an_object_without_a_break_has_no_parts(tmp_path):
     shot = shoot([Part((0.0, 0.0, 0.0), (0.9, 0.8, 0.7))], sphere_lights(24, least_z=0.2), side=SIDE, across=2.2)
     maps, report = solved(shot, tmp_path)
