@@ -136,15 +136,13 @@ def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
     return lowered
 
 
-def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: float) -> Breaks:
-    """Cut a surface where its normals turn abruptly or contradict each other; reads slopes and weights back to the host.
-
-    `slopes` are of all pairs of neighbours, `spacing` is their mean distance in the plane of x and y.
-    """
+def find_breaks(slopes: Slopes, surface: NormalMap, kind: np.ndarray | None, *, grid: Grid, spacing: float) -> Breaks:
+    """Cut a surface where its normals turn abruptly or contradict each other, or its kind [rows, cols] changes; reads slopes and weights
+    back to the host. `slopes` are of all pairs of neighbours, `spacing` is their mean distance in the plane of x and y."""
     noise = loop_noise(slopes, grid=grid)
     lowered = distrust_loops(slopes, noise=noise, grid=grid)
     whole, left = ((to_numpy(w.right), to_numpy(w.down)) for w in (slopes.weights, lowered.weights))
-    found = cut(surface, (to_numpy(slopes.right), to_numpy(slopes.down)), whole, left, grid=grid, spacing=spacing)
+    found = cut(surface, kind, (to_numpy(slopes.right), to_numpy(slopes.down)), whole, left, grid=grid, spacing=spacing)
     return Breaks(lowered, noise, found, np.where(found.way == 1, left[1][found.first], left[0][found.first]))
 
 
@@ -158,7 +156,7 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     if not len(found.first):
         return Broken(height, found.label, np.arange(found.count), solve(lowered, height, last=True))
     edges = (found.way, found.first)
-    _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
+    _set(lowered.weights, edges, np.where(found.turned | found.unlike, 0.0, kept))
     solve(lowered, height, last=False)
     parts = connect(found, to_numpy(height), noise=noise)
     _set(lowered.weights, edges, np.where(parts.between, 0.0, kept))

@@ -53,13 +53,15 @@ class Fragments(NamedTuple):
     slope: np.ndarray  # [E] in units of the spacing
     weight: np.ndarray  # [E] that of the edge if it crosses no break
     turn: np.ndarray  # [E] angle between the two normals, radians
-    turned: np.ndarray  # [E] bool, whether the normals turn abruptly; else only loops contradict themselves
+    turned: np.ndarray  # [E] bool, whether the normals turn abruptly
     jump: np.ndarray  # [E] difference between the slopes of the two normals
     edge_on: np.ndarray  # [E] bool, whether one of the two sides is seen edge on where it ends
+    unlike: np.ndarray  # [E] bool, whether the two sides are of different kinds; where neither, only loops contradict themselves
 
 
-def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid: Grid, spacing: float) -> Fragments:
-    """Cut a surface wherever its normals turn abruptly or contradict each other around a loop.
+def cut(surface: NormalMap, kind: np.ndarray | None, slope: Planes, weight: Planes, left: Planes, *, grid: Grid, spacing: float
+        ) -> Fragments:
+    """Cut a surface wherever its normals turn abruptly or contradict each other around a loop, or its kind [rows, cols] changes.
     `slope`: of the edges to the right and of those down, each [size], in units of the spacing. `weight`: of these edges before loops are
     looked at; 0 is no edge. `left`: weights that the loops leave. `spacing`: distance of neighbouring pixels in the plane of x and y."""
     there = np.stack([plane > 0 for plane in weight])
@@ -67,8 +69,9 @@ def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid
     usable[1:] |= there[0, :-1]
     usable[grid.pitch :] |= there[1, : -grid.pitch]
     turned = _turned(surface, there, grid)
-    lost = turned.copy()
-    if turned.any():
+    unlike = _unlike(kind, there, grid)
+    lost = turned | unlike
+    if lost.any():
         for edges, held, whole, kept in zip(lost, there, weight, left, strict=True):
             for cells in _pieces(len(held)):
                 edges[cells] |= held[cells] & (kept[cells] < LEAST_TRUST * whole[cells])
@@ -96,7 +99,8 @@ def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid
 
     return Fragments(label, count, first, second, way, of_edges(slope), of_edges(weight),
                      np.arccos(np.clip((sides[0] * sides[1]).sum(axis=0), -1.0, 1.0)), turned[way, first],
-                     np.abs(alone[0] - alone[1]), np.minimum(*ends) < EDGE_ON**2)
+                     np.abs(alone[0] - alone[1]), np.minimum(*ends) < EDGE_ON**2,
+                     unlike[way, first])
 
 
 def _pieces(count: int) -> Iterator[slice]:
@@ -121,6 +125,17 @@ def _turned(surface: NormalMap, there: np.ndarray, grid: Grid) -> np.ndarray:
             cells = abrupt[piece]
             turned[way, cells[_rounded(surface, there[way], cells, way, step, grid)]] = False
     return turned
+
+
+def _unlike(kind: np.ndarray | None, there: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return [2, size] bool, the edges at which the kind changes."""
+    found = np.zeros_like(there)
+    if kind is not None:
+        cells = np.zeros(grid.size, kind.dtype)
+        grid.pixels(cells)[:] = kind
+        for way, step in enumerate((1, grid.pitch)):
+            found[way, :-step] = there[way, :-step] & (cells[:-step] != cells[step:])
+    return found
 
 
 def _rounded(surface: NormalMap, there: np.ndarray, edge: np.ndarray, way: int, step: int, grid: Grid) -> np.ndarray:

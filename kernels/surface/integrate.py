@@ -60,6 +60,7 @@ def integrate_normals(
     mean_z: float,
     sigma: np.ndarray | wp.array | None = None,  # [rows, cols] float16 or float32, degrees
     cuts: tuple[np.ndarray, np.ndarray] | None = None,  # [rows, cols] bool each
+    kind: np.ndarray | None = None,  # [rows, cols] int
     options: IntegrationOptions | None = None,
     device: str,
     progress: Callable[[float], None] | None = None,
@@ -79,6 +80,8 @@ def integrate_normals(
         sigma: standard errors of the normals; None: all are sure.
         cuts: edges between a pixel and its right neighbour, and between it and the one below, that the surface breaks along; what
             they cut off is a part.
+        kind: the kind of material of each pixel; where breaks are looked for, a surface may break between two kinds however its normals
+            turn. None: all are of one.
         progress: told the fraction done, 0…1.
 
     Convention:
@@ -108,7 +111,7 @@ def integrate_normals(
         return solver.solve(h, tolerance=options.tolerance, progress=progress)
 
     if options.discontinuities:
-        breaks = find_breaks(slopes, surface, grid=grid, spacing=spacing)
+        breaks = find_breaks(slopes, surface, None if kind is None else kind[box], grid=grid, spacing=spacing)
         del slopes, surface, x, y  # the solver needs the memory
         h, fragment, part_of, done = integrate_broken(breaks, grid=grid, solve=improve)
         fragment = grid.pixels(fragment)

@@ -149,7 +149,7 @@ def _march(first: int,
                 top, bottom = wp.max(top, rim), wp.min(bottom, rim)
             if here != last or (here == moving) == moves:
                 crossed = 0
-            if top > NO_GAP and (here < 0 or (here == moving) == moves):
+            if top > NO_GAP and here != last:
                 gaps = _with_run(gaps, bottom, top)
                 top, bottom = float(NO_GAP), float(-NO_GAP)
             last = here

@@ -30,6 +30,9 @@ LEAST_PULL = 1e-9
 """Weight, of that of all edges, by which the constant of each part is drawn to 0, so that parts that share no edge have one."""
 LIKE_TURN = np.radians(5.0)
 """Angle between normals below which they are alike."""
+UNLIKE_TURN = np.radians(25.0)
+"""Angle by which normals turn along most of the edge between two kinds of material, as of metal and paint, from which on these are apart,
+however well they meet: an inlay, a stripe and a gilded rim go on as the surface does."""
 SLIVER_PIXELS = 3.0
 """Mean width of a fragment below which it may be one of mixed pixels along an outline: twice its pixels over its cut edges."""
 SURROUNDED = 0.8
@@ -167,6 +170,9 @@ def _join_meeting(seam: _Seam, low: int, high: int, play: np.ndarray) -> None:
     """Join two groups if one shift makes them meet along most of the edge that they share, and the smaller one meets its neighbours along
     most of its whole outline: a short stretch of an outline meets whatever lies behind it."""
     first, second = seam.sides()
+    shared = ((first == low) & (second == high)) | ((first == high) & (second == low))
+    if 2 * np.count_nonzero((seam.found.unlike & (seam.found.turn > UNLIKE_TURN))[shared]) > np.count_nonzero(shared):
+        return
     outline = np.flatnonzero(((first == low) | (second == low)) & (first != second))
     other = np.where(first[outline] == low, second[outline], first[outline])
     met, shift = _met(seam, low, outline[other == high], play)
@@ -180,7 +186,8 @@ def _join_meeting(seam: _Seam, low: int, high: int, play: np.ndarray) -> None:
 
 def _met(seam: _Seam, low: int, edges: np.ndarray, play: np.ndarray) -> tuple[int, float]:
     """Return at how many edges between a group and another the shift that is best makes them meet, and that shift of the group."""
-    telling = edges[~seam.found.edge_on[edges]]
+    found = seam.found
+    telling = edges[~found.edge_on[edges] | (found.unlike & ~found.turned)[edges]]  # an inlay near a rim goes on as the surface does
     if len(telling) <= MEETING * len(edges):
         return 0, 0.0
     needed = np.where(seam.sides()[0][telling] == low, 1, -1) * seam.rest()[telling]

@@ -87,7 +87,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     """Find what the object does to its own light, or return None when no pixel is solved.
     `normal`: [3, pixels] float32, found so far. `bouncing`: [3, pixels] albedo of the light that other surfaces send. `parts`: whether
     parts are moved in depth to where their shadows agree with the images; not under near lights."""
-    whole = partial(integrate, given, normal, solved, stage="surface")
+    whole = partial(integrate, given, normal, solved, specular=material.specular, stage="surface")
     surface = whole()
     if surface is None:
         return None

@@ -16,6 +16,8 @@ GUESSED_SIGMA = 30.0
 """Standard error, in degrees, of a normal above which its slope is a guess."""
 GUESSED_PART = 0.1
 """Part of the surface that may rest on such normals before it is said."""
+LEAST_METAL = 0.3
+"""F0 in its brightest channel from which on a material is a metal."""
 LEAST_THIN = 20
 """Pixels on thin parts of the mask from which they are said: a mask that was drawn by hand has some at its rim."""
 RINGS = 8
@@ -23,12 +25,14 @@ RINGS = 8
 
 
 def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigma: np.ndarray | None = None,
-              cuts: tuple[np.ndarray, np.ndarray] | None = None, stage: str = "height") -> Integration | None:
+              specular: np.ndarray | None = None, cuts: tuple[np.ndarray, np.ndarray] | None = None, stage: str = "height"
+              ) -> Integration | None:
     """Integrate the normals of the solved pixels.
 
     Args:
         normal: [3, pixels] float32.
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
+        specular: [3, pixels] F0: the surface may break where a metal meets a dielectric; None: not known.
         cuts: edges to the right, and edges down, that the surface breaks along besides, [rows, cols] bool each.
         stage: what the progress calls this work.
 
@@ -41,8 +45,14 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     camera = given.camera
     return integrate_normals(normal.reshape(3, *solved.shape), solved, *camera.plane_views(),
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
-                             sigma=None if sigma is None else sigma.reshape(solved.shape), cuts=cuts, options=OPTIONS,
+                             sigma=None if sigma is None else sigma.reshape(solved.shape), cuts=cuts,
+                             kind=None if specular is None else _metals(specular.reshape(3, *solved.shape)), options=OPTIONS,
                              device=given.device, progress=given.timings.advance_percent)
+
+
+def _metals(specular: np.ndarray) -> np.ndarray:
+    """Return where F0 [3, rows, cols] is that of a metal, [rows, cols] bool, but for single pixels."""
+    return np.asarray(ndimage.median_filter(specular.max(axis=0) > LEAST_METAL, size=3))
 
 
 def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:

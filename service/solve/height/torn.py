@@ -16,6 +16,8 @@ from kernels.surface.offsets import Offset
 from service.solve.base.solution import SolveInput
 from service.solve.height.part_scene import LEAST_SHARE, MOST_PARTS, Material, PartScene
 
+SWEEPS = 2
+"""Times that every fragment is moved, each against the others where these lie now."""
 APART_SIGMAS = 3.0
 """Distance, in its σ, at which shadows place a fragment from where it was joined, from which on it is cut off."""
 
@@ -40,13 +42,17 @@ def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Materi
     if not judged:
         return surface, height
     scene = PartScene(given, lights, normal, material, height, fragment)
-    apart: dict[int, Offset] = {}
+    moved_by: dict[int, Offset] = {}
     main = int(np.argmax(np.bincount(part_of, weights=size)))
-    for number in judged[:MOST_PARTS]:
+    for number in SWEEPS * judged[:MOST_PARTS]:
         others = np.flatnonzero((part_of == main) | (part_of == part_of[number]))
         step = scene.step_of(number, against=[int(other) for other in others if other != number])
-        if scene.is_known(step.low, step.high) and abs(step.offset) > APART_SIGMAS * step.sigma:
-            apart[number] = step
+        before = moved_by.pop(number).offset if number in moved_by else 0.0
+        known = scene.is_known(step.low, step.high)
+        scene.move(number, step.offset if known else -before)
+        if known:
+            moved_by[number] = step._replace(offset=before + step.offset)
+    apart = {number: step for number, step in moved_by.items() if abs(step.offset) > APART_SIGMAS * step.sigma}
     if not apart:
         return surface, height
     out = np.isin(fragment, list(apart))

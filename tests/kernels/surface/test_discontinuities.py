@@ -142,3 +142,31 @@ def test_the_size_of_bands_changes_nothing(perspective, device, monkeypatch):
     np.testing.assert_array_equal(banded.height.numpy(), whole.height.numpy())
     np.testing.assert_array_equal(banded.part, whole.part)
     assert len(parts_of(whole)) > 1
+
+
+def test_another_material_behind_an_edge_is_a_part_of_its_own(device):
+    """A coin with a bevel of 45° on a board meets it all along its outline; of another material, it may lie on it or stand before it.
+
+    It stays where it meets the board in the mean. Tolerance: half a pixel in each of the two directions of a turn of 45°.
+    """
+    x, y = shapes.plane_coordinates(128, 128, size=128)
+    radius = np.hypot(x, y)
+    bevel = (radius > 24) & (radius < 32)
+    shape = shapes.from_gradient(x, y, np.clip(32 - radius, 0, 8), *(np.where(bevel, -side / np.maximum(radius, 1), 0) for side in (x, y)))
+    assert len(parts_of(solve(shape, device, discontinuities=True))) == 1
+    found = solve(shape, device, discontinuities=True, kind=radius < 32)
+    assert parts_of(found).tolist() == [(radius >= 32).sum(), (radius < 32).sum()]
+    assert worst(found, shape) * np.ptp(shape.z) < 1
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_an_inlay_goes_on_as_the_surface_does(noise, device):
+    """Dots, stripes and a half of another material on a cap, which turns by 70° up to its rim. Tolerance: single precision."""
+    shape = shapes.cap(128)
+    shape = shape._replace(normal=(shape.normal + noise * np.random.default_rng(0).normal(size=shape.normal.shape)).astype(np.float32))
+    row, col = np.indices(shape.mask.shape)
+    plain = solve(shape, device, discontinuities=True)
+    for kind in (np.hypot(row % 26 - 13, col % 26 - 13) < 6, row % 32 < 11, col > 70):
+        found = solve(shape, device, discontinuities=True, kind=kind)
+        assert len(parts_of(found)) == len(parts_of(plain)) == 1
+        np.testing.assert_allclose(found.height.numpy(), plain.height.numpy(), atol=1e-5 + 1e-3 * noise)

@@ -12,11 +12,11 @@ from tests.kernels.surface import shapes
 from tests.reference import surface as reference
 
 
-def solve(shape, device, *, perspective=False, mean_z=None, sigma=None, **options):
+def solve(shape, device, *, perspective=False, mean_z=None, sigma=None, kind=None, **options):
     if mean_z is None:
         mean_z = float(shape.z[shape.mask].mean())
     return integrate_normals(
-        shape.normal, shape.mask, shape.x, shape.y, perspective=perspective, mean_z=mean_z, sigma=sigma,
+        shape.normal, shape.mask, shape.x, shape.y, perspective=perspective, mean_z=mean_z, sigma=sigma, kind=kind,
         options=IntegrationOptions(**options), device=device,
     )
 

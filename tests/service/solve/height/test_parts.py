@@ -165,6 +165,26 @@ def test_an_object_without_a_break_has_no_parts(tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("slope", [0.05, 0.3])
+def test_a_metal_ring_before_paint_is_told_by_its_material(slope, tmp_path):
+    """The normals of the ring go on in those of the body, behind it and in its hole: all were one part, or the ring and its hole.
+
+    Tolerance: two pixels of 2.2 / 96, and three σ.
+    """
+    normal = np.array([0.6 * slope, 0.8 * slope, 1.0]) / np.hypot(slope, 1.0)
+    ring = Part((0.1, 0.05, 1.0), (0.45,) * 3, normal=tuple(normal), hole=0.25, albedo=(0.0,) * 3, f0=(0.9, 0.7, 0.4), roughness=0.4)
+    body = ball_before_body()[1]._replace(f0=(0.04,) * 3)
+    shot = shoot([ring, body], sphere_lights(64, least_z=-0.2), side=96, across=2.2, noise=0.01)
+    maps, report = solved(shot, tmp_path, Method.SVBRDF)
+    assert [part["status"] for part in report["parts"]] == ["reference", "known", "known"]
+    assert np.mean(maps.part[shot.part == 0] == 2) > 0.99
+    error = maps.height - shot.z
+    for part in (2, 3):
+        step = abs(np.median(error[maps.part == part]) - np.median(error[maps.part == 1]))
+        assert step < min(2 * 2.2 / 96, 3 * report["parts"][part - 1]["sigma"])
+
+
+@pytest.mark.long
 def test_metal_before_metal_is_placed_by_svbrdf(tmp_path):
     """Bare metal is dark wherever it does not mirror a light: that is no shadow, and a highlight in shadow is none either."""
     parts = [Part((0.1, 0.15, 0.8), (0.3, 0.3, 0.3), albedo=(0.0, 0.0, 0.0), f0=(0.9, 0.7, 0.4), roughness=0.45),
