@@ -51,8 +51,8 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
 
 
 def _metals(specular: np.ndarray) -> np.ndarray:
-    """Return where F0 [3, rows, cols] is that of a metal, [rows, cols] bool, but for single pixels."""
-    return np.asarray(ndimage.median_filter(specular.max(axis=0) > LEAST_METAL, size=3))
+    """Return where F0 [3, rows, cols] is that of a metal at most of the pixels around, [rows, cols] bool."""
+    return np.asarray(ndimage.uniform_filter((specular.max(axis=0) > LEAST_METAL).astype(np.float32), 3) > 0.5)
 
 
 def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:
