@@ -154,7 +154,7 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     lowered, noise, found, kept = breaks
     height = grid.zeros()
     if not len(found.first):
-        return Broken(height, found.label, np.arange(found.count), solve(lowered, height, last=True))
+        return Broken(height, found.label, np.arange(found.count, dtype=np.int32), solve(lowered, height, last=True))
     edges = (found.way, found.first)
     _set(lowered.weights, edges, np.where(found.turned | found.unlike, 0.0, kept))
     solve(lowered, height, last=False)

@@ -47,7 +47,7 @@ class Integration(NamedTuple):
     @property
     def part(self) -> np.ndarray | None:
         """[rows, cols] int: pixels of one number are connected across no break, -1 outside. None: breaks were not looked for."""
-        return None if self.fragment is None or self.part_of is None else np.append(self.part_of, -1)[self.fragment]
+        return None if self.fragment is None or self.part_of is None else np.append(self.part_of, np.int32(-1))[self.fragment]
 
 
 def integrate_normals(

@@ -70,7 +70,7 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
             _join_meeting(seam, low, high, play)
     first, second = seam.sides()
     groups, part = np.unique(seam.group, return_inverse=True)
-    return Parts(found.label, part[kept], len(groups), first != second)
+    return Parts(found.label, part[kept].astype(np.int32), len(groups), first != second)
 
 
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:

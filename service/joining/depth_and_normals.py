@@ -76,9 +76,10 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     found = integrate_normals(normal.astype(np.float32), solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective,
                               mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
                               options=IntegrationOptions(discontinuities=True), device=device, progress=progress)
-    assert found.part is not None
+    part = found.part
+    assert part is not None
     base = plane.to_heights(to_numpy(found.height).astype(np.float64), solved)
-    part = np.where(solved, found.part, -1)
+    part = np.where(solved, part, -1)
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
     known, relief, left = both & cuts.depth, 0.0, 0.0

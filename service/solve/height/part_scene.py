@@ -12,7 +12,7 @@ from kernels.photometric.shadows.shadow_evidence import shadow_odds
 from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection, extent_of
 from kernels.surface.slopes import STEEPEST
-from service.solve.base.batches import View, pick_pixels, view_directions
+from service.solve.base.batches import pick_pixels, view_directions
 from service.solve.base.solution import SolveInput
 from service.solve.height.height import mean_height, projection_of
 from stage.colour.colour import GREY_WEIGHTS
@@ -54,29 +54,28 @@ class Material(NamedTuple):
 
 
 class PartScene:
-    """A surface whose parts move, and the shadows that its readings show."""
+    """A surface whose parts move, and the shadows that its readings show; `show` says which parts, and where they are."""
 
-    def __init__(self, given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, height: np.ndarray, part: np.ndarray):
-        self._height, self._part, self._device = height.astype(np.float64), part, given.device
+    def __init__(self, given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, mask: np.ndarray):
+        """Compare the readings of a surface with its shadows. `mask`: [rows, cols] bool, where there is surface."""
+        self._device, self._cols = given.device, mask.shape[1]
         self._mean = mean_height(given.camera)
         self._perspective = given.camera.projection == "perspective"
         whole = projection_of(given.camera)
-        step = math.ceil(max(part.shape) / GRID_SIDE)
+        step = math.ceil(max(mask.shape) / GRID_SIDE)
         self._step, self._thin = step, (slice(step // 2, None, step),) * 2
         centre = wp.vec2(*((float(whole.centre[i]) - 0.5 - step // 2) / step + 0.5 for i in (0, 1)))
         self._projection = Projection(self._perspective, whole.scale / float(step), centre)
         pixel = 1.0 / (0.5 * (self._projection.scale[0] + self._projection.scale[1]))  # in log depth, or in the unit of height
         self._blur, self._pixel = BLUR_PIXELS * pixel, pixel
-        self.size = self._extent() * pixel / step
+        self.size = float(max(np.ptp(axis) + 1 for axis in np.nonzero(mask))) * pixel / step
         """Longer side of the object, in the unit of offsets."""
 
-        self._thin_part = np.ascontiguousarray(part[self._thin]).astype(np.int32)
-        inside: np.ndarray = np.argwhere(self._thin_part >= 0)
+        inside: np.ndarray = np.argwhere(mask[self._thin])
         lit = evenly(given.stack.light_count, MOST_LIGHTS)
         inside = inside[evenly(len(inside), READINGS // len(lit))]
-        self._on = self._thin_part[tuple(inside.T)]
-        pixels, view = self._positions(inside), view_directions(given.camera)
-        self._thickness = self._guess_thickness(normal, view)
+        self._read, self._normal, self._view = inside, normal, view_directions(given.camera)
+        pixels, view = self._positions(inside), self._view
         readings = readings_of(pick_pixels(given, lights, view, pixels))[:, lit]
         toward = lights.direction[: given.stack.light_count][lit].astype(np.float64)
         self._odds = shadow_odds(readings, toward, normal[:, pixels].T, view(pixels), material.grey(pixels), device=given.device)
@@ -86,9 +85,16 @@ class PartScene:
         self._pixels = wp.array(inside.astype(np.int32), dtype=wp.vec2i, device=given.device)
         self._toward = wp.array(toward.astype(np.float32), dtype=wp.vec3, device=given.device)
 
+    def show(self, height: np.ndarray, part: np.ndarray) -> None:
+        """Let parts [rows, cols] int, -1 outside of the mask, move from where a height [rows, cols] has them."""
+        self._height, self._part = height.astype(np.float64), part
+        self._thin_part = np.ascontiguousarray(part[self._thin]).astype(np.int32)
+        self._on = self._thin_part[tuple(self._read.T)]
+        self._thickness = self._guess_thickness()
+
     def _positions(self, inside: np.ndarray) -> np.ndarray:
         """Return the positions in the image of [n, 2] rows and columns of the thinned picture."""
-        return (inside * self._step + self._step // 2) @ np.array([self._part.shape[1], 1])
+        return (inside * self._step + self._step // 2) @ np.array([self._cols, 1])
 
     def step_of(self, number: int, *, against: list[int]) -> Offset:
         """Return how far a part should move against some others; the rest is not there."""
@@ -107,7 +113,7 @@ class PartScene:
         """Return whether offsets between these bounds place a part."""
         return -self.size < low and high < self.size and high - low < 2 * OPEN * self.size
 
-    def _guess_thickness(self, normal: np.ndarray, view: View) -> np.ndarray:
+    def _guess_thickness(self) -> np.ndarray:
         """Return the distance from front to back of parts that are mirrored in their outlines, on the thinned picture.
 
         The outline is taken as plane. Where a part turns away from the viewer, its outermost pixel stands before its outline by the
@@ -124,7 +130,7 @@ class PartScene:
             mine = part == number
             outline = mine & ~inner
             pixels = self._positions(np.argwhere(outline))
-            facing = np.clip((normal[:, pixels].T * view(pixels)).sum(axis=1), STEEPEST, 1)
+            facing = np.clip((self._normal[:, pixels].T * self._view(pixels)).sum(axis=1), STEEPEST, 1)
             before = np.where(facing < TURNED_AWAY, np.sqrt(1 - facing**2) / facing, 0) * self._pixel
             level = cells[mine] @ np.linalg.lstsq(cells[outline], surface[outline] - before, rcond=None)[0]
             out[mine] = 2 * np.maximum(surface[mine] - level, 0)
@@ -156,7 +162,3 @@ class PartScene:
         mean = self._height[inside].mean()
         moved = self._height * (self._mean / mean) if self._perspective else self._height + (self._mean - mean)
         return np.where(inside, moved, 0).astype(np.float32)
-
-    def _extent(self) -> float:
-        """Return the longer side of the object, in pixels of the image."""
-        return float(max(np.ptp(axis) + 1 for axis in np.nonzero(self._part >= 0)))

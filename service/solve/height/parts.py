@@ -6,6 +6,7 @@ shadows leave open stays where the normals put it.
 """
 
 import math
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,9 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
                 height: np.ndarray, again: Again) -> tuple[Integration, Placement]:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images; return the surface too, of which
     shadows may have parted what normals joined. `normal`: [3, pixels] float32. `height`: [rows, cols] float32, that of the surface."""
-    surface, height = tear(given, lights, normal, material, surface, height, again)
+    assert surface.fragment is not None
+    scene_of = cache(partial(PartScene, given, lights, normal, material, surface.fragment >= 0))  # its readings are looked at once
+    surface, height = tear(surface, height, scene_of, again)
     part = surface.part
     assert part is not None
     size = np.bincount(part[part >= 0])
@@ -98,7 +101,8 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     moved = moved[size[moved] >= LEAST_SHARE * size.sum()]
     if not len(moved):
         return surface, Placement(height, [])
-    scene = PartScene(given, lights, normal, material, height, part)
+    scene = scene_of()
+    scene.show(height, part)
     found: dict[int, Offset] = {}
     contradiction: dict[int, float | None] = {}
     for _ in range(SWEEPS):

@@ -5,21 +5,21 @@ body may do so though it stands far before it. Each fragment that was joined to 
 the shadows place it elsewhere, beyond doubt, the surface is cut around it and integrated again.
 """
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
 from kernels.device import to_numpy
-from kernels.photometric.lambertian.readings import Lights
 from kernels.surface.integrate import Integration
 from kernels.surface.offsets import Offset
-from service.solve.base.solution import SolveInput
-from service.solve.height.part_scene import LEAST_SHARE, MOST_PARTS, Material, PartScene
+from service.solve.height.part_scene import LEAST_SHARE, MOST_PARTS, PartScene
 
 SWEEPS = 2
 """Times that every fragment is moved, each against the others where these lie now."""
 APART_SIGMAS = 3.0
 """Distance, in its σ, at which shadows place a fragment from where it was joined, from which on it is cut off."""
+
 
 class Again(Protocol):
     """Integrates the normals again."""
@@ -28,10 +28,9 @@ class Again(Protocol):
         """Break the surface along some edges to the right, and some down, too, [rows, cols] bool each."""
 
 
-def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, surface: Integration,
-         height: np.ndarray, again: Again) -> tuple[Integration, np.ndarray]:
+def tear(surface: Integration, height: np.ndarray, scene_of: Callable[[], PartScene], again: Again) -> tuple[Integration, np.ndarray]:
     """Return a surface with the fragments apart that shadows part, and its height [rows, cols] float32.
-    `normal`: [3, pixels] float32. `height`: [rows, cols] float32, that of the surface."""
+    `height`: [rows, cols] float32, that of the surface. `scene_of`: returns the scene in which its parts move."""
     fragment, part_of = surface.fragment, surface.part_of
     assert fragment is not None and part_of is not None
     size = np.bincount(fragment[fragment >= 0], minlength=len(part_of))
@@ -41,7 +40,8 @@ def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Materi
     judged = [int(number) for number in largest_first if host[part_of[number]] != number and size[number] >= LEAST_SHARE * size.sum()]
     if not judged:
         return surface, height
-    scene = PartScene(given, lights, normal, material, height, fragment)
+    scene = scene_of()
+    scene.show(height, fragment)
     moved_by: dict[int, Offset] = {}
     main = int(np.argmax(np.bincount(part_of, weights=size)))
     for number in SWEEPS * judged[:MOST_PARTS]:
@@ -60,8 +60,9 @@ def tear(given: SolveInput, lights: Lights, normal: np.ndarray, material: Materi
     cuts[0][:, :-1] = out[:, 1:] != out[:, :-1]
     cuts[1][:-1] = out[1:] != out[:-1]
     found = again(cuts=cuts)
-    assert found is not None and found.part is not None
+    assert found is not None
     part, moved = found.part, to_numpy(found.height).copy()
+    assert part is not None
     for each in np.unique(part[np.isin(fragment, np.flatnonzero(np.isin(part_of, part_of[list(apart)])))]):
         mine = part == each
         number = int(np.bincount(fragment[mine]).argmax())

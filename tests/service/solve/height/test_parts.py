@@ -102,7 +102,8 @@ def test_a_ring_is_placed_by_the_light_through_its_hole(slope, lights, tmp_path)
     normal = np.array([0.6 * slope, 0.8 * slope, 1.0]) / np.hypot(slope, 1.0)
     ring = Part((0.1, 0.05, 1.3), (0.45,) * 3, normal=tuple(normal), hole=0.25)
     directions = sphere_lights(lights, least_z=0.5) if lights < 48 else sphere_lights(lights)
-    maps, report = solved(shot := shoot([ring, ball_before_body()[1]], directions, side=SIDE, across=2.2, noise=0.02), tmp_path)
+    shot = shoot([ring, ball_before_body()[1]], directions, side=SIDE, across=2.2, noise=0.02)
+    maps, report = solved(shot, tmp_path)
     assert [part["status"] for part in report["parts"]] == ["reference", "known", "unknown"]
     error = maps.height - shot.z
     front, hole = (abs(np.median(error[maps.part == part]) - np.median(error[maps.part == 1])) for part in (2, 3))
