@@ -227,8 +227,8 @@ def estimate_rows(device: Published = H200) -> list[str]:
     speed = core_speed()
     counted = " and ".join(f"{small} and {large} (`{name}`)" for name, work in WORKS.items() for small, large in [work.sides])
     columns = [_column(work, at_full_size(name), speed, device) for name, work in WORKS.items()]
-    return [f"An estimate for one {device.name}, made without one; what one took is in \"Products on a GPU\". Nothing is taken to overlap. "
-            "Its terms:", "",
+    return [f"An estimate for one {device.name}, made without one; what a GPU took is in \"Products on a GPU\". Nothing is taken to "
+            "overlap. Its terms:", "",
             "- copies: bytes between host and device over the speed of the link",
             "- launches: their number, and that of the reads that wait for the device, times the time of a launch",
             "- memory: bytes of all arrays that launches were given, over the bandwidth",

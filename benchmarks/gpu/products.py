@@ -1,6 +1,6 @@
 """The product on a GPU at full size: seconds of each stage of a solve and of relit frames.
 
-    python -m benchmarks.gpu.products FOLDER                   # 12.6 megapixels, 96 lights, 24 frames: 25 GB in the folder, removed again
+    python -m benchmarks.gpu.products FOLDER                   # 12.6 megapixels, 96 lights, 240 frames: 45 GB in the folder, removed again
     python -m benchmarks.gpu.products FOLDER --tiles 6         # 3.1 megapixels
     python -m benchmarks.gpu.products FOLDER --write           # put the table into docs/figures.md
 
@@ -29,7 +29,7 @@ from service.solve.solve import solve
 from stage.formats import exr
 from tests.device_ways import LIGHTS, distant
 
-SIDE, TILES, FRAMES = 256, 12, 24
+SIDE, TILES, FRAMES = 256, 12, 240
 """Pixels along a side of the dome; domes in a column, of which a row has a third more; relit frames."""
 HEADING = "## Products on a GPU"
 BRIEF_S = 0.5
