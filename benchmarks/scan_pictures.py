@@ -23,7 +23,7 @@ from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import applied, inverse
 from service.scans.register import register_scans
-from stage.colour.colour import pixels_of
+from stage.formats.images import pixels_of
 from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import DISTANCE_M, MM, View, figure, turntable
 

@@ -8,12 +8,12 @@ import numpy as np
 import OpenImageIO as oiio
 
 from service.reporting.provenance import colour_configuration
-from stage.colour.colour import pixels_of, through_view
+from stage.colour.colour import through_view
 from stage.colour.colour_spaces import Review
 from stage.colour.configuration import current
 from stage.files import replacing
 from stage.formats import exr
-from stage.formats.images import write_png
+from stage.formats.images import pixels_of, write_png
 
 TILE = 320
 """Height of one picture, pixels."""

@@ -16,10 +16,10 @@ from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.manifest import LIT_BY, Frame
-from stage.colour.colour import convert, pixels_of
+from stage.colour.colour import convert
 from stage.errors import ImageError, StageError, storage
 from stage.files import replacing
-from stage.formats.images import write_jpeg
+from stage.formats.images import pixels_of, write_jpeg
 from stage.results.light_basis import numbers
 from stage.stack.correction import Correction
 from stage.stack.ingest import BYTES_PER_PIXEL, DECODE_BYTES

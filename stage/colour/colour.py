@@ -1,15 +1,17 @@
 """Conversion of pixels between colour spaces.
 
-The arithmetic is OpenColorIO's, through OpenImageIO, with the configuration of `stage.colour.configuration`.
+The arithmetic is OpenColorIO's, with the configuration of `stage.colour.configuration`.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
-import OpenImageIO as oiio
+import PyOpenColorIO as ocio
 
 from stage.colour.colour_spaces import Review, channels_apart, is_linear, linear_space
-from stage.colour.configuration import current
+from stage.colour.configuration import current, loaded
 from stage.colour.location import location
 from stage.errors import ColourError
 from stage.formats.images import fractions
@@ -18,6 +20,9 @@ LARGEST_INTEGER = 65535
 """The full scale of 16-bit images."""
 ROUNDING = 1.2e-7
 """Difference from the fraction of an integer that decoders leave: an ulp of one, a hundredth of the step of 16-bit integers."""
+
+BAND = 1 << 16
+"""Most pixels that one thread converts at a time."""
 
 GREY_WEIGHTS = (0.299, 0.587, 0.114)
 """The luma weights of red, green and blue by ITU-R BT.601: published photometric stereo figures are computed on this grey."""
@@ -68,12 +73,12 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
     if source == target:
         return pixels
     grey = pixels.shape[2] == 1
-    converted = np.ascontiguousarray(np.repeat(pixels, 3, axis=2) if grey else pixels, dtype=np.float32)
-    for configuration, begin, end in current().steps(source, target):
-        buffer = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(converted), begin, end, colorconfig=configuration)
-        if buffer.has_error:
-            raise ColourError(f"cannot convert {source} to {target}: {' '.join(buffer.geterror().split())}")
-        converted = pixels_of(buffer)
+    converted = np.array(np.repeat(pixels, 3, axis=2) if grey else pixels, dtype=np.float32, order="C")
+    try:
+        for configuration, begin, end in current().steps(source, target):
+            _apply(loaded(configuration).getProcessor(begin, end), converted)
+    except ocio.Exception as error:
+        raise ColourError(f"cannot convert {source} to {target}: {' '.join(str(error).split())}") from error
     return converted[..., :1] if grey else converted
 
 
@@ -86,11 +91,26 @@ def through_view(pixels: np.ndarray, space: str, review: Review) -> np.ndarray:
         return convert(pixels, space, "srgb_texture")
     if found.find(space) is None:
         pixels, space = convert(pixels, space, found.aces(space)), found.aces(space)
-    source = oiio.ImageBuf(np.ascontiguousarray(pixels, dtype=np.float32))
-    buffer = oiio.ImageBufAlgo.ociodisplay(source, *chosen, space, look, colorconfig=found.location)
-    if buffer.has_error:
-        raise ColourError(f"cannot show {space}: {' '.join(buffer.geterror().split())}")
-    return pixels_of(buffer)
+    shown, config, pipeline = np.array(pixels, dtype=np.float32, order="C"), loaded(found.location), ocio.LegacyViewingPipeline()
+    pipeline.setDisplayViewTransform(ocio.DisplayViewTransform(space, *chosen))
+    pipeline.setLooksOverrideEnabled(bool(look))
+    pipeline.setLooksOverride(look)
+    try:
+        _apply(pipeline.getProcessor(config), shown)
+    except ocio.Exception as error:
+        raise ColourError(f"cannot show {space}: {' '.join(str(error).split())}") from error
+    return shown
+
+
+def _apply(processor: ocio.Processor, pixels: np.ndarray) -> None:
+    """Convert [rows, cols, 3] float32 pixels in place, bands of them side by side."""
+    rgb, convert_band = pixels.reshape(-1, 3), processor.getDefaultCPUProcessor().applyRGB
+    bands = [rgb[begin : begin + BAND] for begin in range(0, len(rgb), BAND)]
+    if len(bands) == 1:
+        convert_band(rgb)
+    else:
+        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-colour") as pool:
+            list(pool.map(convert_band, bands))
 
 
 def rgb_matrix(source: str, target: str) -> np.ndarray:
@@ -98,11 +118,3 @@ def rgb_matrix(source: str, target: str) -> np.ndarray:
     Returns [3, 3] float32: rgb in `target` = matrix @ rgb in `source`."""
     primaries = np.eye(3, dtype=np.float32)[None]  # one row of three pixels: red, green and blue
     return np.ascontiguousarray(convert(primaries, source, target)[0].T)
-
-
-def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
-    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32."""
-    pixels = buffer.get_pixels(oiio.FLOAT)
-    if pixels is None:
-        raise ValueError(buffer.geterror())
-    return np.asarray(pixels)

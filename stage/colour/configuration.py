@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import OpenImageIO as oiio
+import PyOpenColorIO as ocio
 
 from stage.colour.colour_spaces import NAMES
 from stage.colour.location import BUILT_IN, STUDIO, VARIABLE, location
@@ -80,7 +80,7 @@ class Configuration(NamedTuple):
     @property
     def cache_id(self) -> str:
         """The cache id that OpenColorIO gives the configuration: a hash of its text, and one of its folder and its variables."""
-        return _cache_id(self.location, self.label)
+        return str(loaded(self.location).getCacheID())
 
     def steps(self, source: str, target: str) -> list[tuple[str, str, str]]:
         """Return the conversions that lead from one space to another: a configuration's location and two names of it each.
@@ -175,10 +175,21 @@ def used(place: str | None) -> Iterator[None]:
 def configuration(place: str) -> Configuration:
     """Read a configuration; one that was read before and whose file has not changed is not read again.
     Raises ColourError if it cannot be read; the message names it."""
+    return _read(place, _changed(place))
+
+
+def loaded(place: str) -> ocio.Config:
+    """Return a configuration as OpenColorIO holds it, which keeps the processors that were asked of it.
+    Raises ColourError if it cannot be read; the message names it."""
+    return _loaded(place, _changed(place))
+
+
+def _changed(place: str) -> int:
+    """Return when the file of a configuration was changed last, nanoseconds; 0 for a built-in one."""
     if place.startswith("ocio://"):
-        return _read(place, 0)
+        return 0
     try:
-        return _read(place, os.stat(place).st_mtime_ns)
+        return os.stat(place).st_mtime_ns
     except OSError as error:
         raise ColourError(f"--ocio or ${VARIABLE}: {place}: no such OpenColorIO configuration") from error
 
@@ -195,13 +206,16 @@ def linear_of(place: str, space: str) -> tuple[str, bool]:
     colours = np.array(list(product(PROBES, repeat=3)), np.float32)
     crosstalk = {}
     for linear in sorted(found.linear, key=lambda each: -SequenceMatcher(None, each, name).ratio()):  # the likely ones first
-        buffer = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(colours[None].copy()), name, linear, colorconfig=place)
-        if not buffer.has_error:
-            values = np.moveaxis(np.asarray(buffer.get_pixels(oiio.FLOAT)).reshape(3, 3, 3, 3), -1, 0)
-            spread = [np.ptp(np.moveaxis(values[c], c, 0).reshape(3, -1), axis=1).max() for c in range(3)]
-            crosstalk[linear] = float(max(spread) / max(np.abs(values).max(), 1e-30))
-            if crosstalk[linear] <= ROUNDING:
-                break
+        converted = colours.copy()
+        try:
+            loaded(place).getProcessor(name, linear).getDefaultCPUProcessor().applyRGB(converted)
+        except ocio.Exception:  # no transform between the two
+            continue
+        values = np.moveaxis(converted.reshape(3, 3, 3, 3), -1, 0)
+        spread = [np.ptp(np.moveaxis(values[c], c, 0).reshape(3, -1), axis=1).max() for c in range(3)]
+        crosstalk[linear] = float(max(spread) / max(np.abs(values).max(), 1e-30))
+        if crosstalk[linear] <= ROUNDING:
+            break
     best = min(crosstalk, key=lambda each: crosstalk[each], default=None)
     if best is not None and crosstalk[best] <= CROSSTALK:
         return _declared(found, best), True
@@ -213,36 +227,35 @@ def linear_of(place: str, space: str) -> tuple[str, bool]:
 
 def _declared(found: Configuration, name: str) -> str:
     """Return a space's name of the Color Interop Forum where the configuration knows the space by it, else the name itself."""
-    identifier = oiio.ColorConfig(found.location).get_color_interop_id(name)
+    identifier = loaded(found.location).getColorSpace(name).getInteropID()
     return identifier if identifier and found.find(identifier) == name else name
 
 
 @cache
-def _cache_id(place: str, label: str) -> str:
-    """Return the cache id of a configuration; the label tells its content."""
-    import PyOpenColorIO  # a second copy of the library, which no pixel goes through: OpenImageIO does not tell the cache id of its own
-
-    return str(PyOpenColorIO.Config.CreateFromFile(place).getCacheID())
+def _loaded(place: str, changed: int) -> ocio.Config:
+    try:
+        return ocio.Config.CreateFromFile(place)
+    except ocio.Exception as error:
+        reason = re.sub(r"^Error: Loading the OCIO profile .* failed. ", "", " ".join(str(error).split())).rstrip(".")
+        raise ColourError(f"--ocio or ${VARIABLE}: {place}: is no OpenColorIO configuration that can be read: {reason}") from error
 
 
 @cache
 def _read(place: str, changed: int) -> Configuration:
-    config = oiio.ColorConfig(place)
-    if fault := config.geterror():
-        reason = re.sub(r'^Error reading OCIO config "[^"]*": (Error: Loading the OCIO profile .* failed. )?', "", " ".join(fault.split()))
-        raise ColourError(f"--ocio or ${VARIABLE}: {place}: is no OpenColorIO configuration that can be read: {reason.rstrip('.')}")
-    spaces = config.getColorSpaceNames()
-    names = {alias.lower(): name for name in spaces for alias in config.getAliases(name)}
-    roles = {role.lower(): str(config.getColorSpaceNameByRole(role)) for role in config.getRoles()}
+    config = _loaded(place, changed)
+    spaces = {name: config.getColorSpace(name) for name in config.getColorSpaceNames(ocio.SEARCH_REFERENCE_SPACE_ALL, ocio.COLORSPACE_ALL)}
+    names = {alias.lower(): name for name, space in spaces.items() for alias in space.getAliases()}
+    roles = {role.lower(): str(config.getRoleColorSpace(role)) for role in config.getRoleNames()}
     names |= roles
     names |= {name.lower(): name for name in spaces}
-    displays = sorted(config.getDisplayNames(), key=lambda display: display != config.getDefaultDisplayName())
-    views = {display: tuple(sorted(config.getViewNames(display), key=lambda view: view != config.getDefaultViewName(display)))
+    displays = sorted(config.getDisplays(), key=lambda display: display != config.getDefaultDisplay())
+    views = {display: tuple(sorted(config.getViews(display), key=lambda view: view != config.getDefaultView(display)))
              for display in displays}
-    data = tuple(name for name in spaces if config.isData(name))
-    linear = tuple(name for name in spaces if name not in data and config.isColorSpaceLinear(name))
+    data = tuple(name for name, space in spaces.items() if space.isData())
+    linear = tuple(name for name in spaces if name not in data and any(
+        config.isColorSpaceLinear(name, kind) for kind in (ocio.REFERENCE_SPACE_SCENE, ocio.REFERENCE_SPACE_DISPLAY)))
     if place.startswith("ocio://"):
-        label = f"{place} OpenColorIO {oiio.get_string_attribute('opencolorio_version')}"
+        label = f"{place} OpenColorIO {ocio.__version__}"
     else:
         label = f"{Path(place).name.replace(' ', '_')} sha256:{_digest(Path(place))}"
     return Configuration(place, names, linear, data, views, tuple(config.getLookNames()), tuple(roles), label)

@@ -248,6 +248,14 @@ def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
             decoder.close()
 
 
+def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
+    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32."""
+    pixels = buffer.get_pixels(oiio.FLOAT)
+    if pixels is None:
+        raise ValueError(buffer.geterror())
+    return np.asarray(pixels)
+
+
 def _orientation(path: Path, spec: oiio.ImageSpec) -> int:
     """Return the orientation in which the pixels of a file are recorded."""
     found = int(spec.get_int_attribute("Orientation", UPRIGHT)) if path.suffix.lower() in ORIENTED_SUFFIXES else UPRIGHT

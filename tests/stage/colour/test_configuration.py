@@ -148,7 +148,7 @@ def test_the_label_changes_with_the_content_and_its_tables(tmp_path):
 
 @pytest.mark.parametrize("place", ["ocio://default", STUDIO, "minimal"])
 def test_the_cache_id_is_that_of_opencolorio(tmp_path, place):
-    """The library that tells it reads the same configuration as the one within OpenImageIO, which converts."""
+    """The library within OpenImageIO, with which other tests compare colours, reads the same configuration."""
     place = minimal(tmp_path / "house.ocio") if place == "minimal" else place
     with used(place):
         read = PyOpenColorIO.Config.CreateFromFile(place)
