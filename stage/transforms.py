@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator
-from scipy.spatial.transform import Rotation
 
 RIGID_TOLERANCE = 1e-4
 """The largest difference between R Rᵀ and the identity: matrices are typed and printed with four digits or more."""
@@ -34,7 +33,8 @@ def off_rotation(matrix: np.ndarray) -> float:
 
 def scaled_rotation(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation [3, 3] of a quaternion [4] (x, y, z, w) times the square of its length, which is 1 unless it was rounded."""
-    return Rotation.from_quat(quaternion).as_matrix() * float(quaternion @ quaternion)
+    axis, w = quaternion[:3], quaternion[3]  # Euler and Rodrigues
+    return (w * w - axis @ axis) * np.eye(3) + 2 * np.outer(axis, axis) + 2 * w * np.cross(np.eye(3), axis)
 
 
 def rigid_fault(matrix: np.ndarray, tolerance: float = RIGID_TOLERANCE) -> str | None:
