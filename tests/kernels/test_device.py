@@ -128,6 +128,7 @@ def test_a_driver_that_is_too_old_is_said(driver, outdated, monkeypatch):
     assert ("supports CUDA 12.9, and Warp needs CUDA 13.0" in str(refused.value)) == outdated
 
 
+@pytest.mark.long
 def test_a_kernel_is_loaded_from_those_made_ahead(tmp_path):
     """Warp compiles a file ahead for the CPU, under the name that it has with CUDA's blocks, and it is loaded as CUDA loads a cubin:
     another process finds it by its name and compiles nothing."""

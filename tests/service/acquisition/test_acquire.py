@@ -258,6 +258,7 @@ def test_a_picture_of_another_size_than_the_rigs_camera_is_refused_and_the_captu
     check(tmp_path / "capture", stage)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_the_wait_for_a_person(tmp_path, stage):
     rig, _ = by_hand(tmp_path, stage)
     person, terminal = os.openpty()

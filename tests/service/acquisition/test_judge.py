@@ -18,6 +18,7 @@ DIRECTIONS = np.array([[0, 0, 1], [1, 0, 0], [0, 0.6, 0.8], [-1, 0, 0.0]])
 RIG = rig_of(Scene(np.zeros(0), DIRECTIONS))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scene", "seed", "kinds"), [(1, 1, ()), (1, 1, KINDS), (108, 8, KINDS)])
 def test_each_fault_is_named_with_its_frame_and_none_else(scene, seed, kinds):
     """The second scene has two lamps whose pictures differ by a fifth of what the third nearest differs by, beside pictures left out."""
@@ -37,6 +38,7 @@ def test_each_fault_is_named_over_random_seeds(scene, seeds):
         assert found == made, seed
 
 
+@pytest.mark.long
 def test_lamps_of_unequal_light_are_judged_by_what_the_rig_says_of_it():
     """Unsaid, one of them looks like ambient light."""
     scene = relief(5)
@@ -122,6 +124,7 @@ def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
     assert reviewed(scene, shots, lambda shot: gain * (scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape))) == (set(), {})
 
 
+@pytest.mark.long
 def test_no_picture_of_the_owl_is_suspected_while_its_neighbours_are_not_there():
     """Lamps spiral round the owl, so that those taken so far stand on one side of the next, and grazing light predicts little."""
     scene, random = owl(), np.random.default_rng(1)

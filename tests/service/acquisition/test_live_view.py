@@ -124,6 +124,7 @@ def test_a_picture_of_a_camera_that_has_one(tmp_path, monkeypatch):
     assert 255 * pixels.mean(axis=(0, 1)) == pytest.approx([200, 100, 50], abs=4)  # JPEG; OpenCV's order is blue first
 
 
+@pytest.mark.long
 def test_the_virtual_camera_has_none_and_the_sentence_says_so(tmp_path):
     stage = Stage(tmp_path / "watch")
     (tmp_path / "card").mkdir()

@@ -123,6 +123,7 @@ def test_what_cannot_be_metered_is_refused(tmp_path, stage, relit):
     assert not (tmp_path / "other" / "capture.json").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("grey", "proposed"), [(100, 0.05), pytest.param(205, 0.01, marks=pytest.mark.long)])
 def test_a_virtual_camera_is_metered_and_left_at_the_longest_time_it_offers(tmp_path, stage, grey, proposed):
     """Its pictures are the same at all times. Grey of 100 reads 13 % of full scale, so that six times the 0.01 s that it has, or less, do;

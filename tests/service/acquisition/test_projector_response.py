@@ -91,6 +91,7 @@ def farthest_from_linear(folder) -> float:
     return worst
 
 
+@pytest.mark.long
 def test_patterns_are_linear_light_once_the_response_is_measured(tmp_path, scene):
     """A level of eight bits is 1/255, at a slope of the response up to 2.3: half of it is .0045; the fit between 17 levels adds less."""
     assert acquire(request(tmp_path, "phase", out=tmp_path / "plain"), refuse_to_ask, scene.tell).faults == ()
@@ -124,6 +125,7 @@ def test_a_capture_goes_on_with_the_response_that_it_measured(tmp_path, scene):
         acquire(request(tmp_path, "projector-response,phase", retake=("projector-response/0002_grey",)), refuse_to_ask, scene.tell)
 
 
+@pytest.mark.long
 def test_white_pictures_between_patterns_show_what_moved_and_what_was_taken_is_shown_again(tmp_path, scene, monkeypatch):
     """The decoded capture has the patterns alone."""
     (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "tracking_every": 5, "sequences": [

@@ -65,6 +65,7 @@ def test_faults_of_a_print_are_told_with_their_size(relit, tmp_path):
     assert (tmp_path / "b" / "out" / "inspection.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_marks_tell_an_offset_of_the_whole_print(relit, tmp_path):
     """The layer lies 30 and -18 µm off the print, which the paste alone does not show; holes, in which nothing is seen, show it."""
     height = surface(Print())
@@ -105,6 +106,7 @@ def test_a_pad_that_was_not_seen_is_not_passed(relit, tmp_path):
     assert [pad["verdict"] for pad in pads.values()].count("not inspected") == 1
 
 
+@pytest.mark.long
 def test_classes_of_limits_and_pads_without_any(relit, tmp_path):
     board, layer = printed(tmp_path / "b", surface(Print(bridge=(4, 5))), 5), write_layer(tmp_path / "paste.gbr")
     file = limits(tmp_path / "limits.json", one={"pads": "pad *", "bridge": "allow"}, two=[{"pads": "pad 1", "volume_percent": [120, 150]}])

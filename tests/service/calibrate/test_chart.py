@@ -75,6 +75,7 @@ def test_charts_are_found_and_colours_corrected_in_twenty_poses_and_three_lights
         assert difference(np.eye(3), light).mean() > 5
 
 
+@pytest.mark.long
 def test_a_chart_corrects_the_capture_and_the_report_says_by_how_much(relit, tmp_path):
     shown = picture(seen(), POSE)
     folder = shoot(tmp_path / "cap", [noisy(shown.pixels)])
@@ -139,6 +140,7 @@ def stain(shown: Picture, patches: dict[int, float], columns=6) -> np.ndarray:
     return pixels
 
 
+@pytest.mark.long
 def test_patches_that_are_clipped_shadowed_or_glaring_are_left_out_by_name(relit, tmp_path):
     shown = picture(seen(), Pose(distance=700))
     pixels = stain(shown, {14: 0.1, 24: 0.05, 8: -0.035})
@@ -178,6 +180,7 @@ LONG_SEARCHED = list(UNREADABLE)[-3:]
 """Those in which the chart is sought on, in up to 75 parts of the picture, after a place that shows no chart."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("words", "placed"), [
     *((words, words in LONG_SEARCHED) for words in UNREADABLE),
     *(pytest.param(words, False, marks=pytest.mark.long) for words in LONG_SEARCHED)])
@@ -216,6 +219,7 @@ def lamp(irradiance=(1, 1, 1), polarization="none"):
     return {"type": "distant", "direction": [0, 0, 1], "irradiance": irradiance, "polarization": polarization}
 
 
+@pytest.mark.long
 def test_polarised_frames_and_lamps_of_other_colours_have_a_matrix_each(relit, tmp_path):
     """The filters before the lens in a cross-polarised frame have a colour; glare lies on other patches in each frame of one kind."""
     filtered, cold = (0.32, 0.30, 0.22), (0.7, 1.0, 1.4)
@@ -251,6 +255,7 @@ def test_polarised_frames_and_lamps_of_other_colours_have_a_matrix_each(relit, t
     assert "shows the chart in such light" in relit("calibrate", "chart", folder, "--apply-to", other).refused("parallel-polarised light")
 
 
+@pytest.mark.long
 def test_lamps_of_several_primaries_have_a_matrix_each_and_a_narrow_one_is_refused(relit, tmp_path):
     """White, red and green, and broad amber LEDs; under deep red alone patches differ in fewer than three colours."""
     colours = {"white": (1.0, 1.0, 1.0), "red and green": (0.9, 0.7, 0.15), "amber": (1.0, 0.6, 0.25), "deep red": (1.0, 0.02, 0.004)}
@@ -284,6 +289,7 @@ def open_passport(folder, pose, light, seed):
     return np.abs(found.corners - shown.corners).max(), np.nanmean(found.kinds[0].colors.after), Capture.open(folder).manifest.color_matrix
 
 
+@pytest.mark.long
 def test_the_24_patches_of_an_open_passport_are_found_beside_its_other_page(tmp_path):
     pose = poses(20)[2]  # OpenCV's detector finds nothing in the whole picture
     off, after, matrix = open_passport(tmp_path / "cap", pose._replace(y=pose.y + 70, distance=800), LIGHTS[2], 2)

@@ -288,6 +288,7 @@ def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
     assert len(report["other_cameras"][0]["views"]) == 7 and report["other_cameras"][0]["rms_px"] < 0.4
 
 
+@pytest.mark.long
 def test_what_is_wrong_with_several_cameras_is_said(relit, tmp_path):
     board = write_board(tmp_path / "board", 2)
     given = "--board", "9x6", "--square-m", 0.03

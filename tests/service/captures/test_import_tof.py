@@ -171,6 +171,7 @@ def kinect_packet(readings):
     return np.packbits(packet, axis=-1, bitorder="little").tobytes()
 
 
+@pytest.mark.long
 def test_a_packet_of_the_kinect(relit, tmp_path):
     """A wall before a Kinect v2 with an offset of each pixel and frequency, which the P0 tables say."""
     u, v = np.meshgrid(np.arange(512) + 0.5, np.arange(424) + 0.5)

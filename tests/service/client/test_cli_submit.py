@@ -39,6 +39,7 @@ def test_a_folder_becomes_maps(relit, tmp_path: Path):
     assert shown["kind"] == "solve"
 
 
+@pytest.mark.long
 def test_what_is_imported_is_sent_without_what_lies_beside_it(relit, tmp_path: Path):
     folder, scene = tmp_path / "dome", make_scene(lights=5)
     for number, image in enumerate(scene.images):
@@ -194,6 +195,7 @@ def identifier(out: str) -> str:
     return next(line.split()[1].rstrip(",") for line in out.splitlines() if line.startswith("sent "))
 
 
+@pytest.mark.long
 def test_pictures_are_sent_as_they_are_taken_and_the_capture_is_whole_after_the_last(capture, stage, tmp_path, client, monkeypatch):
     made, between = [], Between()  # the command's own network
     monkeypatch.setattr("service.cli.sending.Client", lambda url, key: Client(url, key, transport=between))

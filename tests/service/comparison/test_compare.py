@@ -47,6 +47,7 @@ def reported(result) -> dict:
     return json.loads(result.report_path.read_text())
 
 
+@pytest.mark.long
 def test_a_dent_is_found_wherever_the_scan_lies(tmp_path, part):
     made, design = part
     random = np.random.default_rng(3)
@@ -136,6 +137,7 @@ def test_meshes_are_compared_with_their_faces(tmp_path, part):
     assert again.rms_m < 1e-8
 
 
+@pytest.mark.long
 def test_scans_of_something_else_are_refused(tmp_path, part):
     made, design = part
     random = np.random.default_rng(4)

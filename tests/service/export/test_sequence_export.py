@@ -54,6 +54,7 @@ def exported(folder, out, **options):
     return export(ExportRequest(maps=folder, out=out, name="Walk 1", **options))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", ["usdc", "usdz"])
 def test_each_time_code_shows_its_step(walk, tmp_path, suffix):
     found = exported(walk, tmp_path / f"walk.{suffix}")

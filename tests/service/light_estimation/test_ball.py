@@ -69,6 +69,7 @@ def test_a_ball_from_its_mask(name, binary, tolerance_px):
     assert ball.outline_error_px < 0.03
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_what_holds_the_ball_does_not_pull_it(name):
     camera, geometry = SCENES[name]

@@ -15,6 +15,8 @@ from tests.reference.light_basis import srgb
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.publish.published import image
 
+pytestmark = pytest.mark.long  # the fixture takes ten seconds
+
 URL = "https://museum.org/cap"
 SIZE = 1100
 """More than what is there whole."""

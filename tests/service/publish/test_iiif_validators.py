@@ -23,6 +23,7 @@ NOTES = [{"body": "a place", "target": "#xywh=10,20,30,40"},
          {"body": "a point", "target": {"selector": {"type": "PointSelector", "x": 3, "y": 4.5}}}]
 
 
+@pytest.mark.long
 def test_the_image_validator_finds_nothing(relit, tmp_path):
     """Its squares are what a capture shows."""
     pytest.importorskip("magic", reason="the validator needs libmagic", exc_type=ImportError)

@@ -57,6 +57,7 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
         assert (frame[lit].mean(axis=-1) > 0.5 * truth[lit].mean(axis=-1)).mean() > 0.99
 
 
+@pytest.mark.long
 def test_the_share_of_such_light_is_said(relit, scene, tmp_path):
     folder, _ = scene
     maps = write_maps(tmp_path / "maps", SURFACE)

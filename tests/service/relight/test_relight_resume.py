@@ -164,6 +164,7 @@ main()
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGTERM", marks=pytest.mark.long)])
 def test_interrupted_in_the_middle_and_run_again(relit, tmp_path, name):
     cap, out = write_capture(tmp_path / "cap", SCENE), tmp_path / "f"

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
+import pytest
 from pxr import Sdf
 
 from service.reporting.progress import Timings
@@ -40,6 +41,7 @@ def of_text(path: Path) -> tuple:
 READ = {".exr": of_image, ".png": of_image, ".usda": of_layer, ".usdz": of_layer}
 
 
+@pytest.mark.long
 def test_every_kind_of_result_names_the_configuration_and_its_cache_id(relit, tmp_path):
     scene = make_scene(size=SIZE, lights=5)
     cap = write_capture(tmp_path / "cap", scene)

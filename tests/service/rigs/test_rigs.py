@@ -21,6 +21,7 @@ EMITTERS = """<Emitter Name="Red LED" Color="0.64,0.33,20"/><Emitter Name="Green
 <Emitter Name="Blue LED" Color="0.15,0.06,10"/><Emitter Name="White LED" Color="0.3127,0.329,100"/>"""
 
 
+@pytest.mark.long
 def test_a_rig_is_made_of_a_capture(relit, tmp_path):
     """Directions and irradiances are those of the manifest; each lamp has channels of its own."""
     capture = write_small_owl(tmp_path / "owl", 4)

@@ -86,6 +86,7 @@ def test_scans_without_poses_come_together(relit, tmp_path):
     assert np.array(found.scans[0].pose_covariance).max() == 0 and np.array(found.scans[1].pose_covariance).max() > 0
 
 
+@pytest.mark.long
 def test_a_scan_that_is_there_twice_counts_once(relit, tmp_path):
     """The others' poses are to the last bit what they are without it, and so is how sure they are."""
     seen = views(figure, 0, 30, 60)
@@ -167,6 +168,7 @@ def test_wrong_depths_do_not_refuse_a_start_that_decides(relit, tmp_path):
     relit.refused("register", folder, "--out", tmp_path / "turned", "--starts")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", [(0.0, 29.0, 61.0), None], ids=["rough angles", "no angles"])
 def test_the_angles_of_a_turntable_are_refined(relit, tmp_path, given):
     seen = views(figure, 0, 30, 60)
@@ -210,6 +212,7 @@ def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
     assert "nothing checks the turntable" in outcome.out + outcome.err
 
 
+@pytest.mark.long
 def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
     seen = views(urn, 0, 90)
     assert "fits as well when it is turned" in relit.refused("register", write(tmp_path / "set", seen), "--out", tmp_path / "none")
@@ -220,6 +223,7 @@ def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
     assert json.loads((tmp_path / "out" / "report.json").read_text())["scans"][1]["pose_sigma_degrees"] > 45
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("change", "sentence"), [
     pytest.param(lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored", marks=pytest.mark.long),
     (lambda points: points * 1000, "the others if its coordinates are multiplied by 0.001, as if"),

@@ -189,6 +189,7 @@ def test_what_is_refused(tmp_path, relit):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_command_says_what_it_made_and_without_joining_each_step_is_a_solve(tmp_path, relit):
     write_sequence(tmp_path / "in", [None] * 2, size=16, noise=NOISE)
     out = relit("solve", tmp_path / "in", "--out", tmp_path / "joined", "--method", "lambert").well()

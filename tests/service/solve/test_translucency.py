@@ -18,6 +18,7 @@ def solved(folder, body, method=Method.ROBUST, **scene):
     return error[maps.mask] / maps.sigma[maps.mask], " ".join(result.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("lengths", "seed"), [((1.0, 0.7, 0.5), 1), ((2.1, 1.5, 1.05), 2), ((3.5, 2.5, 1.75), 3), ((5.0, 2.0, 1.0), 6)])
 @pytest.mark.parametrize("method", [Method.ROBUST, pytest.param(Method.SVBRDF, marks=pytest.mark.long)])
 def test_normals_of_translucent_bodies_are_as_unsure_as_they_are_wrong(tmp_path, method, lengths, seed):

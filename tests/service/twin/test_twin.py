@@ -88,6 +88,7 @@ def test_a_lamp_far_from_every_captured_light_is_named(tmp_path):
     assert "the lamp lamp 0 stands 5° from" in warning
 
 
+@pytest.mark.long
 def test_the_page_shows_frames_until_it_is_interrupted(tmp_path):
     scene = make_scene(lights=LAMPS)
     capture, host = write_capture(tmp_path / "capture", scene), loopback()

@@ -312,6 +312,7 @@ def test_the_sizes_of_the_format_are_those_of_the_code(written):
     assert {code["name"] for code in facts["samples"]["codes"].values()} == {"saturated", "shadowed", "backlit"}
 
 
+@pytest.mark.long
 def test_a_capture_under_lights_that_nobody_has_measured_is_relit_under_those_that_a_solve_found(relit, tmp_path):
     """Placeholders all point at the camera: a picture that was relit with them would be another than it says."""
     sample, folder = ROOT / "samples" / "lambert", tmp_path / "unmeasured"

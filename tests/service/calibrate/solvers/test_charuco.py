@@ -14,6 +14,8 @@ from tests.reference import projector as reference
 from tests.scenes.captures import write_image, write_manifest
 from tests.service.calibrate.solvers.test_procam import fine_rays
 
+pytestmark = pytest.mark.long  # the fixture takes ten seconds
+
 BOARD, SQUARE, SIDE = (7, 5), 0.04, 0.7
 CAMERA = reference.Device(480, 360, 520.0, (-0.12, 0.04, 0.0), (0.0008, -0.001))
 OTHER = reference.Device(480, 360, 560.0, (-0.07, 0.02, 0.0), (-0.0006, 0.0005))
@@ -148,7 +150,6 @@ def test_markers_that_fit_no_board_are_refused():
     assert charuco_of(BoardOptions(board=(7, 5), square_m=0.04)) is None
 
 
-@pytest.mark.long
 def test_the_command_calibrates_two_cameras_and_names_another_dictionary(relit, tmp_path):
     frames = []
     for number, pose in enumerate(poses(5)):

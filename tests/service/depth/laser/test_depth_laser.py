@@ -75,6 +75,7 @@ def test_a_sweep_of_stripes(relit, tmp_path, upright):
     assert 0.5 < np.median(np.abs(ratio)) / 0.6745 < 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("upright", "step"), [(True, 0.004), pytest.param(False, 0.005, marks=pytest.mark.long)])
 def test_planes_in_reverse_order_are_refused(relit, tmp_path, upright, step):
     """A sphere before a plane is seen with a relief of 0.2 m; the sweep in its own order is not refused."""
@@ -93,6 +94,7 @@ def turned(laser, degrees):
     return {**laser, "normal": [x * np.cos(angle) + z * np.sin(angle), y, z * np.cos(angle) - x * np.sin(angle)]}
 
 
+@pytest.mark.long
 def test_planes_that_one_sweep_does_not_confirm_are_said_and_their_accuracy_is_in_sigma(relit, tmp_path):
     """A plane seen under an angle, not a sphere: planes that are all off by one frame, and turned by half a degree."""
     scene = make_scene(sphere=False, camera=CAMERA)
@@ -112,6 +114,7 @@ def test_planes_that_one_sweep_does_not_confirm_are_said_and_their_accuracy_is_i
     assert 0.7 < np.median(ratio) < 1.4  # one deviation off, and the same at every pixel
 
 
+@pytest.mark.long
 def test_two_sweeps_tell_that_planes_of_one_are_off(relit, tmp_path):
     scene = make_scene(sphere=False, camera=CAMERA)
     upright = [plane(0.008 * (number - 4)) for number in range(9)]

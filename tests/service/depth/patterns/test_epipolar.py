@@ -145,6 +145,7 @@ def test_depth_says_it(relit, tmp_path, wrong):
         assert np.median(error) < 1.4 and (error > 5).mean() < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", ["yaw", "roll"])
 def test_a_projector_is_refined(relit, tmp_path, wrong):
     """Depths are nearer to the truth, and σ holds what is left; the report tells the projector."""

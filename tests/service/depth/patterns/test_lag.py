@@ -97,6 +97,7 @@ def fold(albedo: float) -> Light:
                          weight=np.concatenate([seen.weight, weight[pixel, of]]))
 
 
+@pytest.mark.long
 def test_much_of_the_light_that_bounces_in_a_fold_is_in_sigma(relit, tmp_path):
     seen, world = fold(0.8), World(shapes=(), rig=FOLD, read_noise=0.001, electrons=60000.0, bits=16)
     write_capture(tmp_path, world, PATTERNS["waves"], light=seen)

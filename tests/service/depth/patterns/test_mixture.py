@@ -27,6 +27,7 @@ def seen():
     return trace(World(shapes=(WALL, *WIRES), rig=RIG, samples=6)), trace(World(shapes=(WALL,), rig=RIG, samples=1)).depth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PATTERNS)
 def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(relit, tmp_path, seen, name):
     light, wall = seen

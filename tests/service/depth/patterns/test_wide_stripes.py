@@ -44,6 +44,7 @@ def test_edges_number_the_periods(relit, tmp_path, axis, blur):
         assert (np.abs(maps.depth - light.depth) > WRONG_M)[maps.mask].mean() < 0.005
 
 
+@pytest.mark.long
 def test_without_inverses_places_near_an_edge_stay_undecided(relit, tmp_path):
     world = World(shapes=SHAPES, rig=RIGS["column"])
     light = trace(world)

@@ -101,6 +101,7 @@ def test_dark_and_bare_parts_are_refused(relit, tmp_path):
     assert (maps.mask & dark & (np.abs(pixels_off(maps, left.depth)) > 1)).sum() < 0.01 * dark.sum()
 
 
+@pytest.mark.long
 def test_an_offset_between_rows_is_told(relit, tmp_path):
     left, right, _ = seen("plane and sphere")
     folder = write(tmp_path, left.images, right.images)

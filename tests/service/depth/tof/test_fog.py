@@ -45,6 +45,7 @@ def solved(folder, counts):
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
 
 
+@pytest.mark.long
 def test_fog_is_named_and_is_no_surface(tmp_path):
     counts, distance = histograms(0.15)
     found = solved(tmp_path, counts)
@@ -54,6 +55,7 @@ def test_fog_is_named_and_is_no_surface(tmp_path):
     assert mask.mean() > 0.3 and np.median(ratio) < 1.4 and np.mean(ratio > 5) < 0.01  # the shift by the slope is a bound
 
 
+@pytest.mark.long
 def test_fog_that_hides_everything_leaves_nothing_solved(tmp_path):
     counts, _ = histograms(1.5)
     assert not solved(tmp_path, counts).maps.mask.any()

@@ -41,6 +41,7 @@ def is_calibrated(part):
     assert np.mean(part > 5) < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), pytest.param(2000, 4.0, marks=pytest.mark.long)])
 def test_pile_up_that_is_not_declared_is_found(pulses, background, tmp_path):
     """Taken for Poisson counts, these ranges are wrong by many sigma at confidence 1."""

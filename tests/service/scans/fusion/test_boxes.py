@@ -125,6 +125,7 @@ def test_a_box_beside_a_camera_is_not_seen():
     assert window == (0, SIZE[1], 0, SIZE[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("parallel", [False, True], ids=["perspective", "orthographic"])
 def test_the_places_of_a_scan_hold_all_blocks_that_it_marks_whatever_its_noise(tmp_path, parallel):
     """A pixel in fifty is a hundred times as noisy as the others, and one knows nothing: it alone reaches through the whole scene."""

@@ -97,6 +97,7 @@ def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     assert twice.mesh_path.read_bytes() == once.mesh_path.read_bytes()
 
 
+@pytest.mark.long
 def test_a_scan_without_overlap_is_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots[:3]]
     poses[2][0, 3] += 3.0
@@ -106,6 +107,7 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     assert warning.startswith("scan view 2: ")
 
 
+@pytest.mark.long
 def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
     file = write_scans(tmp_path, shots[::5], coloured=True)
     measured, closed = (fuse(FuseRequest(scan_set=file, out=tmp_path / close, voxel_m=2 * VOXEL, texture=False, device="cpu", close=close))

@@ -63,6 +63,7 @@ def test_points_and_range_images_make_one_surface(tmp_path, clouds):
     assert np.median(errors(result)) < SIGMA and all(scan["fused"] for scan in result.facts["scans"])
 
 
+@pytest.mark.long
 def test_a_range_image_of_points_says_what_the_scanner_saw(tmp_path, clouds):
     """Each pixel lies on the true surface by what its σ says, in the world; σ is at most that of a point."""
     file, listed = read_scan_set(write_set(tmp_path, [entry(clouds[0], tmp_path, 0)]))

@@ -12,6 +12,8 @@ from service.scans.points.ply_points import read_ply_points
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
+pytestmark = pytest.mark.long  # its fixture takes six seconds
+
 VOXEL = 3e-3
 """A brick is 0.77 m: the statue lies in several."""
 
@@ -31,7 +33,6 @@ def vertices(path) -> np.ndarray:
     return np.concatenate([ply.points, ply.normals, ply.colours, ply.sigma[:, None]], axis=1)
 
 
-@pytest.mark.long
 def test_tiles_hold_the_vertices_and_faces_of_the_mesh(both):
     whole, tiled = both
     parts = sorted((tiled.report_path.parent / "tiles").glob("*.ply"))

@@ -89,12 +89,14 @@ def test_small_and_large_noise(sigma):
     assert step @ np.linalg.solve(found.covariances[1], step) < 30  # of χ² with six degrees of freedom, one in 25 000 is larger
 
 
+@pytest.mark.long
 def test_point_sets_without_a_camera_come_together():
     views = seen(figure, 0, 40, 80)
     wrong = off(views, registered(views, points_only=True))
     assert len(wrong) == 3 and np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.2 * MM
 
 
+@pytest.mark.long
 def test_few_noisy_points_with_little_in_common_come_together():
     """1200 points each, some 20 mm apart and 6 mm of noise: a fit of 200 matched points is right to about a third of that, and to a degree.
 
@@ -153,6 +155,7 @@ def statues(count: int, rows: int, numbers: range | tuple[int, ...]) -> list[Vie
                  shot.true) for shot in shots]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pair", [(3, 6), pytest.param((0, 8), marks=pytest.mark.long)], ids=["quarter turn", "half turn"])
 def test_a_body_is_told_from_its_turned_self_by_what_sticks_out(pair):
     """The turned pose matches more of the surface; it would put arm, blade and plates where the other camera saw through."""

@@ -270,6 +270,7 @@ def test_a_job_cannot_read_what_is_anothers(site, job):
     assert in_general(theirs, {name: site.ours[name] for name in made}) == in_general(nothing, made)
 
 
+@pytest.mark.long
 def test_a_service_without_keys_answers_this_machine_and_no_form_of_another_site(server, client):
     port = server.url.rpartition(":")[2]
     for host in ("localhost", f"localhost:{port}", "127.0.0.1", "127.5.0.1:80", f"[::1]:{port}"):

@@ -79,6 +79,7 @@ def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
         client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
 
 
+@pytest.mark.long
 def test_all_jobs_of_a_project_are_watched_at_once(server, client, dome):
     with client.stream("GET", "/v1/events") as response:
         found = told(response.iter_lines())

@@ -87,6 +87,7 @@ def test_a_name_that_cannot_be_stored_is_named_before_anything_is_sent(client, n
     refused(client.post("/v1/needed-files", json={"files": files}), 422, name.replace("\n", "\\n"))
 
 
+@pytest.mark.long
 def test_photographs_with_a_table_of_lights_become_a_capture(server, client, tus, tmp_path):
     folder = write_photographs(tmp_path / "photos")
     looked = looked_at(server, client, tus, folder, "owl <b>")
@@ -106,6 +107,7 @@ def test_photographs_with_a_table_of_lights_become_a_capture(server, client, tus
     refused(client.post(f"/v1/captures/{ready['id']}/guess"), 409, "ready already")
 
 
+@pytest.mark.long
 def test_what_is_missing_is_chosen_and_a_wrong_choice_can_be_mended(server, client, tus, tmp_path):
     looked = looked_at(server, client, tus, write_four_phases(tmp_path / "tof"))
     proposal = looked["facts"]["proposal"]
@@ -140,6 +142,7 @@ def test_a_choice_that_leads_out_of_the_capture_is_refused(client, capture, fiel
     refused(client.post(f"{capture}/import", json={"layout": "lp", "file": "../x.lp"}), 422, "file: leads out")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["relightlab", "lp"])
 def test_files_that_name_images_of_others_get_none(server, client, tus, tmp_path, way):
     """A project that names the folder of another capture, or an image above its own, as RelightLab and an .lp file may."""

@@ -205,6 +205,7 @@ def test_what_is_no_annotation_of_the_image_is_refused(client, noted, change, wo
     refused(client.post(f"/v1/captures/{noted}/annotations", json=POINT | change), 422, words)
 
 
+@pytest.mark.long
 def test_a_capture_has_so_many_and_no_more(client, noted, monkeypatch, server):
     full = admitted(server, client, SAMPLES / "lambert")["id"]
     path = f"/v1/captures/{full}/annotations"

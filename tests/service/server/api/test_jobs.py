@@ -23,6 +23,7 @@ def test_a_pipeline_solves_exports_and_relights(server, client, dome, sky):
     assert made_by(client, job) == {"maps.exr", "report.json", "asset.usdz", "frame.0001.exr", "frame.0002.exr", "frame.0003.exr"}
 
 
+@pytest.mark.long
 def test_a_solve_and_an_export_that_brings_lights_along(server, client, dome, solved, sky):
     job = client.get(f"/v1/jobs/{solved}").json()
     assert job["request"]["options"] == {"albedo_scale": None, "align": False, "align_to": None, "crop": None, "clip_negative": False,

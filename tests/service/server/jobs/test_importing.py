@@ -58,6 +58,7 @@ class Killed(BaseException):
     """As if the process had ended."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
 @pytest.mark.parametrize("last", ["before", "after"])
 def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):

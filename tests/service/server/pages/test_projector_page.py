@@ -108,6 +108,7 @@ def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp
         assert np.array_equal(seen > EXPOSURE / 2, draw(frame.pattern, size) > 0.5), frame.pattern
 
 
+@pytest.mark.long
 def test_a_window_of_another_size_is_refused(browser, tmp_path, watched):
     request = request_of(tmp_path, watched, {"sequences": [{"take": "patterns", "code": "ramp"}]}, (640, 480))
     page = new_context(browser, viewport={"width": 600, "height": 400}).new_page()

@@ -30,6 +30,7 @@ def solved(relit, folder, *options):
     return outcome.out, json.loads((folder / "out" / "report.json").read_text()), SurfaceMaps.read(folder / "out" / "maps.exr")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("radii", "count"), [(3.0, 8), pytest.param(1.5, 16, marks=pytest.mark.long)])
 def test_the_distance_is_found(relit, tmp_path, radii, count):
     """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""

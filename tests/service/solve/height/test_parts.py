@@ -132,6 +132,7 @@ def test_steps_of_random_layouts_are_right_within_their_sigma(kind, seed, tmp_pa
             assert placed["status"] == "unknown" and kind != "ball"
 
 
+@pytest.mark.long
 def test_shadows_part_what_meets_all_along_its_outline(tmp_path):
     """A disc with a hole, 50 pixels before a body: one shift makes it meet the body along three quarters of its two outlines.
 

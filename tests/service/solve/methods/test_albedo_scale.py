@@ -148,6 +148,7 @@ def test_maps_have_the_albedo_of_the_surface(by_declaration):
     assert result.maps.albedo_scale == report["found"]["albedo_factor"] == pytest.approx(SCALE, rel=0.12)
 
 
+@pytest.mark.long
 def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):
     _, _, report = by_declaration["absolute"]
     assert "albedo_scale" not in report["found"]

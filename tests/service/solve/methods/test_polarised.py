@@ -63,6 +63,7 @@ def test_svbrdf_finds_every_material(found):
     assert found_of["pixels_without_diffuse_light"] == SCENE.of("metal").sum()
 
 
+@pytest.mark.long
 def test_errors_are_those_that_sigma_says(found):
     maps = found[0].maps
     inside = SCENE.surface.mask
@@ -81,6 +82,7 @@ def test_a_metal_has_no_albedo_even_where_nobody_declares_the_leak(tmp_path, fou
     assert LEAK <= report["found"]["polarisation"]["leak_at_most"] < 0.03
 
 
+@pytest.mark.long
 def test_robust_normals_of_glossy_surfaces_are_better_than_without_polarisers(leaking, plain):
     with_pairs, without = (solved(folder, Method.ROBUST)[0].maps for folder in (leaking, plain))
     for name in ("plastic", "black"):
@@ -89,6 +91,7 @@ def test_robust_normals_of_glossy_surfaces_are_better_than_without_polarisers(le
     assert not with_pairs.mask[metal].any()
 
 
+@pytest.mark.long
 def test_svbrdf_is_as_good_as_without_polarisers(found, plain):
     """Diffuse images gather half of the light, so that noise turns their normals by up to √2 as much."""
     without = solved(plain)[0].maps
