@@ -82,6 +82,7 @@ def true_maps(check: Check) -> Path:
     folder.mkdir(exist_ok=True)
     SurfaceMaps(camera=solved.camera, mask=check.mask, normal=layer("normal", "XYZ"), diffuse_albedo=layer("diffuse_albedo", "RGB"),
                 specular=layer("specular", "RGB"), roughness=layer("roughness", "Y")[..., 0], height=layer("height", "Z")[..., 0],
+                part=layer("part", "Y")[..., 0].astype(np.uint8) if "part.Y" in channels else None,
                 provenance=solved.provenance).write(folder / MAPS_FILE)
     return folder
 

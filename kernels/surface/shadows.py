@@ -3,8 +3,8 @@ and the height of the surface is compared with it.
 
 A point is in shadow when the surface stands above the line by more than a margin: a part of a pixel, and a slope by which a
 height integrated from normals may err. Only surface that the camera sees can cast a shadow here. Of another part of the object than the
-point's own, which may be thin, only the visible front does: the line must pass through it, and one that lies behind it from where it comes
-into the picture of that part to where it leaves passes behind the part.
+point's own only the visible front does, and what lies behind it within a guessed thickness, where one is given: the line must pass through
+either, and one that stays farther behind from where it comes into the picture of that part to where it leaves passes behind the part.
 """
 
 from typing import Any, NamedTuple
@@ -73,11 +73,16 @@ class Relief:
     camera: Camera
     box: wp.vec4i  # as in Extent
     highest: float
+    thickness: wp.array2d(dtype=float)  # [rows, cols] from front to back, as a camera-frame length
+    has_backs: bool  # without: only fronts hide light, and there is no thickness
 
 
-def relief_of(height: wp.array, mask: wp.array, projection: Projection, extent: Extent | None = None) -> Any:
+def relief_of(height: wp.array, mask: wp.array, projection: Projection, extent: Extent | None = None,
+              thickness: wp.array | None = None) -> Any:
     """Return the `Relief` of a surface on the device; its extent is found where it is not given."""
     relief = Relief()
+    relief.has_backs = thickness is not None
+    relief.thickness = wp.empty((0, 0), dtype=wp.float32, device=height.device) if thickness is None else thickness
     relief.height, relief.mask, relief.camera = height, mask, projection.on_device()
     relief.box, relief.highest = extent or extent_of(to_numpy(height), to_numpy(mask))
     return relief
@@ -153,6 +158,8 @@ def in_shadow_within(relief: Relief, row: int, col: int, toward: wp.vec3, reach:
             hidden = under
             if part != own:
                 hidden = part == last and under != behind
+                if relief.has_backs:
+                    hidden = hidden or (under and above < relief.thickness[r, c])
             last, behind = part, under
             if hidden:
                 break

@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.device import to_numpy
-from kernels.relight.model.shading import shade as shade_surface
 from kernels.relight.model.sources import join
 from service.errors import RequestError
 from service.relight.clipping import Clipping
@@ -136,7 +134,7 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
     timings.stage("shade", len(model.pixels))
     done = 0
     for batch in model.batches():
-        lit = to_numpy(shade_surface(batch.surface, light, model.see(rows, batch.pixels)))[:, : len(batch.pixels)]
+        lit = model.lit(batch, light, model.see(rows, batch.pixels))
         frame[:, batch.pixels], specular[:, batch.pixels] = lit[:3] + lit[3:], lit[3:]
         done += len(batch.pixels)
         timings.advance(done)

@@ -14,12 +14,15 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.packs import Band
-from kernels.relight.model.shading import PLANES, SecondLobe, Surface, upload_surface
+from kernels.relight.model.shading import PLANES, SecondLobe, Surface, shade, upload_surface
+from kernels.relight.model.sources import Sources
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.surface.shadows import extent_of
+from service.relight.footprint import NARROW, surface_within, turns_within
 from service.solve.base.batches import view_directions
 from service.solve.height.height import projection_of
+from service.solve.height.thickness import guess_thickness
 from stage.errors import ResultError
 from stage.results.maps import LOBES, SurfaceMaps
 
@@ -40,6 +43,23 @@ class ModelBatch(NamedTuple):
 
     pixels: np.ndarray  # [n] row-major positions in the image
     surface: Surface
+    profile: np.ndarray | None  # [n, 3] of the specular part; None: that of the BRDF
+
+
+class Lobes(NamedTuple):
+    """The specular lobes of some pixels."""
+
+    specular: np.ndarray  # [n, 3] F0 of the first
+    roughness: np.ndarray  # [n, 1] of the first
+    second: SecondLobe | None
+
+    @property
+    def narrowest(self) -> np.ndarray:
+        """[n] Width α of the narrowest lobe of each pixel; infinite where there is none."""
+        widths = [np.where(self.specular.max(axis=1) > 0, self.roughness[:, 0] ** 2, np.inf)]
+        if self.second is not None:
+            widths.append(np.where(self.second.share[:, 0] > 0, self.second.roughness[:, 0] ** 2, np.inf))
+        return np.min(widths, axis=0)
 
 
 class Portion(NamedTuple):
@@ -86,11 +106,13 @@ class SurfaceModel:
         self.middle = self.places(self.pixels).mean(axis=0)
         """[3] Mean place of these pixels."""
         self._view = view_directions(maps.camera)
-        inside = whole.reshape(maps.mask.shape)
+        inside = self._inside = whole.reshape(maps.mask.shape)
+        self._part = np.zeros(inside.shape, np.uint8) if maps.part is None else maps.part
         self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
-        self._mask = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=device)
+        self._mask = wp.array(np.where(inside, np.maximum(1, self._part), 0).astype(np.uint8), dtype=wp.uint8, device=device)
         self._projection = projection_of(maps.camera)
         self._extent = extent_of(np.where(inside, maps.height, 0), inside)
+        self._thickness = self._guessed_thickness() if len(np.unique(self._part[inside])) > 1 else None
         self.profile: np.ndarray | None = None
         """[n, 3] Profile of the specular part at the solved pixels (kernels.relight.model.lobe_profile); None: that of the BRDF."""
         self._keep = device != "cpu" and 4 * PLANES * len(self.pixels) <= devices.batch_bytes(device, KEPT_BYTES)
@@ -110,29 +132,57 @@ class SurfaceModel:
         return wp.array(self.pixels, dtype=wp.int32, device=self.device)
 
     def _made(self) -> Iterator[ModelBatch]:
-        maps = self.maps
-        assert maps.normal is not None and maps.diffuse_albedo is not None
         for start in range(0, len(self.pixels), self._batch_pixels):
             pixels = self.pixels[start : start + self._batch_pixels]
+            profile = None if self.profile is None else self.profile[start : start + len(pixels)]
+            yield ModelBatch(pixels, self._surface(pixels, self.normals(pixels), self.places(pixels), profile), profile)
 
-            def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
-                return values.reshape(maps.mask.size, -1)[pixels].astype(np.float32, copy=False)
+    def _surface(self, pixels: np.ndarray, normal: np.ndarray, places: np.ndarray, profile: np.ndarray | None) -> Surface:
+        """Put pixels on the device, with these normals and places."""
+        lobes, maps = self._lobes(pixels), self.maps
+        assert maps.diffuse_albedo is not None
+        return upload_surface(normal, self._rows(maps.diffuse_albedo, pixels), lobes.specular, lobes.roughness, self._view(pixels),
+                              places, second=lobes.second, profile=profile, device=self.device)
 
-            specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
-            if maps.specular is not None and maps.roughness is not None:
-                specular, roughness = rows(maps.specular), rows(maps.roughness)
-            second = None
-            if maps.abundance is not None:
-                layers = (maps.first_specular, maps.first_roughness, maps.second_specular, maps.second_roughness)
-                first_specular, first_roughness, *other = (rows(layer) for layer in layers if layer is not None)
-                abundance = rows(maps.abundance)
-                specular = np.where(abundance > 0, first_specular, specular)
-                roughness = np.where(abundance > 0, first_roughness, roughness)
-                second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
-            yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
-                                                    self.places(pixels), second=second,
-                                                    profile=None if self.profile is None else self.profile[start : start + len(pixels)],
-                                                    device=self.device))
+    def _rows(self, values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        return values.reshape(self.maps.mask.size, -1)[pixels].astype(np.float32, copy=False)
+
+    def _lobes(self, pixels: np.ndarray) -> Lobes:
+        """Return the specular lobes of pixels."""
+        maps = self.maps
+        specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
+        if maps.specular is not None and maps.roughness is not None:
+            specular, roughness = self._rows(maps.specular, pixels), self._rows(maps.roughness, pixels)
+        if maps.abundance is None:
+            return Lobes(specular, roughness, None)
+        layers = (maps.first_specular, maps.first_roughness, maps.second_specular, maps.second_roughness)
+        first_specular, first_roughness, *other = (self._rows(layer, pixels) for layer in layers if layer is not None)
+        abundance = self._rows(maps.abundance, pixels)
+        return Lobes(np.where(abundance > 0, first_specular, specular), np.where(abundance > 0, first_roughness, roughness),
+                     SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0)))
+
+    def lit(self, batch: ModelBatch, light: Sources, visible: wp.array) -> np.ndarray:
+        """Return the radiance of a batch under samples of light: [6, n] float32, diffuse RGB and specular RGB.
+
+        Pixels whose normals turn too much for their lobe (service.relight.footprint) have the mean of several places within them.
+        `visible` is that of `see`.
+        """
+        assert self.maps.normal is not None
+        count = len(batch.pixels)
+        lit = to_numpy(shade(batch.surface, light, visible))[:, :count]
+        turns = turns_within(batch.pixels, self.maps.normal, self.places, self._inside, self._part)
+        narrow = np.flatnonzero((turns[..., :3] ** 2).sum(axis=(0, 2)) > (NARROW * self._lobes(batch.pixels).narrowest) ** 2)
+        if not len(narrow):
+            return lit
+        pixels, profile = batch.pixels[narrow], None if batch.profile is None else batch.profile[narrow]
+        kind = visible.dtype
+        padded = narrow[np.minimum(np.arange(-(-len(narrow) // kind._length_) * kind._length_), len(narrow) - 1)]
+        seen = wp.array(to_numpy(visible).reshape(len(visible), visible.shape[1] * kind._length_)[:, padded].reshape(
+            len(visible), -1, kind._length_), dtype=kind, device=self.device)
+        places = [to_numpy(shade(self._surface(pixels, *there, profile), light, seen))[:, : len(narrow)]
+                  for there in surface_within(self.normals(pixels), self.places(pixels), turns[:, narrow])]
+        lit[:, narrow] = np.mean(places, axis=0)
+        return lit
 
     def places(self, pixels: np.ndarray) -> np.ndarray:
         """Return the places of pixels [n], row-major positions: [n, 3] float32, camera frame."""
@@ -146,7 +196,19 @@ class SurfaceModel:
             place: [n, 4] direction and 0, or position and 1.
             pixels: [m] of a batch.
         """
-        return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, device=self.device)
+        return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, thickness=self._thickness,
+                          device=self.device)
+
+    def _guessed_thickness(self) -> wp.array:
+        """Return how thick the parts are taken to be, on the device."""
+        assert self.maps.height is not None
+        pixels, perspective = np.flatnonzero(self._inside), self._projection.perspective
+        facing, height = np.zeros(self._inside.size), np.where(self._inside, self.maps.height, -1).astype(np.float64)
+        facing[pixels] = (self.normals(pixels) * self._view(pixels)).sum(axis=1)
+        pixel = 2 / float(self._projection.scale[0] + self._projection.scale[1])
+        thickness = guess_thickness(-np.log(-height) if perspective else height, np.where(self._inside, self._part, -1).astype(int),
+                                    facing.reshape(height.shape), pixel)
+        return wp.array((thickness * -height if perspective else thickness).astype(np.float32), dtype=wp.float32, device=self.device)
 
     def normals(self, pixels: np.ndarray) -> np.ndarray:
         """Return [m, 3] float32 normals of pixels [m]."""

@@ -13,16 +13,17 @@ from kernels.surface.shadows import NO_REACH, Extent, Projection, Relief, in_sha
 
 
 def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
-               extent: Extent | None = None, device: str) -> wp.array:
+               extent: Extent | None = None, thickness: wp.array | None = None, device: str) -> wp.array:
     """Return which pixels see which lights, by marching from every pixel to every light.
 
     Args:
         place: [n, 4] unit direction and 0, or position and 1, as of sources.Sources.
         pixels: [m] row-major positions in the image.
         height: [rows, cols] float32, camera-frame z.
-        mask: [rows, cols] uint8, where there is surface.
+        mask: [rows, cols] uint8, where there is surface: the number of its part.
         projection: of the camera; the unit is that of height.
         extent: of the height and mask, from shadows.extent_of; None: it is found.
+        thickness: [rows, cols] float32 from the front of each part to its back; None: light passes behind the front of another part.
 
     Returns:
         [n, P] uint8 packs: 255 where the light is seen, 0 where the surface hides it. The last pack is filled up with the last
@@ -36,7 +37,7 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
     devices.launch(_see_kernel(pack), len(place) * packs,
                    [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device),
-                    relief_of(height, mask, projection, extent)], [visible], device=device, uneven=True)
+                    relief_of(height, mask, projection, extent, thickness)], [visible], device=device, uneven=True)
     return visible
 
 
@@ -44,7 +45,8 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
 def _see_kernel(pack: int) -> Any:
     byte_pack = pack_type(pack, wp.uint8)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    # unrolled on CUDA, so that the bytes of a pack stay in registers
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 4})
     def see_kernel(first: int,
                    places: wp.array(dtype=wp.vec4),  # [N]
                    pixels: wp.array(dtype=wp.int32),  # [P · pack]

@@ -11,10 +11,10 @@ from kernels.photometric.model.samples import evenly, readings_of
 from kernels.photometric.shadows.shadow_evidence import shadow_odds
 from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection, extent_of
-from kernels.surface.slopes import STEEPEST
 from service.solve.base.batches import pick_pixels, view_directions
 from service.solve.base.solution import SolveInput
 from service.solve.height.height import mean_height, projection_of
+from service.solve.height.thickness import guess_thickness
 from stage.colour.colour import GREY_WEIGHTS
 
 LEAST_SHARE = 0.003
@@ -31,8 +31,6 @@ OPEN = 0.2
 """Half of the range of offsets, in parts of the object's size, that may stay open where a step counts as known."""
 BLUR_PIXELS = 0.7
 """Standard deviation, in pixels of the thinned picture, of the place of a shadow's edge."""
-TURNED_AWAY = 0.6
-"""Cosine to the viewer below which the outermost pixels of a part are taken to turn away from the viewer."""
 LEAST_SIGMA_PIXELS = 0.7
 """Least σ of an offset, in pixels of the thinned picture: rays are followed pixel by pixel, and shapes err along outlines, which all lights
 see alike. Errors of path-traced balls and rings are up to 0.8 pixels."""
@@ -90,7 +88,12 @@ class PartScene:
         self._height, self._part = height.astype(np.float64), part
         self._thin_part = np.ascontiguousarray(part[self._thin]).astype(np.int32)
         self._on = self._thin_part[tuple(self._read.T)]
-        self._thickness = self._guess_thickness()
+        thinned = self._height[self._thin]
+        surface = -np.log(np.maximum(-thinned, 1e-12)) if self._perspective else thinned
+        pixels = self._positions(np.argwhere(self._thin_part >= 0))
+        facing = np.zeros(thinned.shape)
+        facing[self._thin_part >= 0] = (self._normal[:, pixels].T * self._view(pixels)).sum(axis=1)
+        self._thickness = guess_thickness(surface, self._thin_part, facing, self._pixel)
 
     def _positions(self, inside: np.ndarray) -> np.ndarray:
         """Return the positions in the image of [n, 2] rows and columns of the thinned picture."""
@@ -112,29 +115,6 @@ class PartScene:
     def is_known(self, low: float, high: float) -> bool:
         """Return whether offsets between these bounds place a part."""
         return -self.size < low and high < self.size and high - low < 2 * OPEN * self.size
-
-    def _guess_thickness(self) -> np.ndarray:
-        """Return the distance from front to back of parts that are mirrored in their outlines, on the thinned picture.
-
-        The outline is taken as plane. Where a part turns away from the viewer, its outermost pixel stands before its outline by the
-        slope of a pixel, as on a sphere.
-        """
-        height, part = self._height[self._thin], self._thin_part
-        surface = -np.log(np.maximum(-height, 1e-12)) if self._perspective else height
-        out = np.zeros(part.shape)
-        framed = np.pad(part, 1, constant_values=-1)
-        inner = np.logical_and.reduce([framed[1:-1, 1:-1] == side for side in (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2],
-                                                                               framed[1:-1, 2:])])
-        cells = np.stack([*np.indices(part.shape), np.ones(part.shape)], axis=-1)
-        for number in np.unique(part[part >= 0]):
-            mine = part == number
-            outline = mine & ~inner
-            pixels = self._positions(np.argwhere(outline))
-            facing = np.clip((self._normal[:, pixels].T * self._view(pixels)).sum(axis=1), STEEPEST, 1)
-            before = np.where(facing < TURNED_AWAY, np.sqrt(1 - facing**2) / facing, 0) * self._pixel
-            level = cells[mine] @ np.linalg.lstsq(cells[outline], surface[outline] - before, rcond=None)[0]
-            out[mine] = 2 * np.maximum(surface[mine] - level, 0)
-        return out
 
     def move(self, number: int, offset: float) -> None:
         """Move a part towards the viewer."""
