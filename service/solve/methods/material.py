@@ -16,6 +16,7 @@ from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_r
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.material.albedo_error import albedo_error
 from kernels.photometric.material.material import MATT, fit_given, fit_material, fit_tinted
+from kernels.photometric.material.metal_energy import with_whole_energy
 from kernels.photometric.material.metal_search import Metals, metals_of
 from kernels.photometric.material.mixtures import HELD, NO_PAIRS, choose_pairs
 from kernels.photometric.material.shared_materials import choose_materials
@@ -236,7 +237,7 @@ class _Walk:
         light.keep(spread, samples)
         # the first search saw bounced light, and a lobe would explain what its normals do not
         normal = find_normals(samples, self.result.normal[:, spread].T, shape=self._shape, sweep=QUICK).best.normal
-        materials = choose_materials(samples, normal, shape=self._lobe)
+        materials = with_whole_energy(samples, normal, choose_materials(samples, normal, shape=self._lobe), shape=self._lobe)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
         single = fit_material(samples, normal, shape=self._lobe, shared=materials)

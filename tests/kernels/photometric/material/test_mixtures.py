@@ -17,8 +17,8 @@ LIGHTS = cap(96, 80.0)
 PIXELS = 120
 
 
-def metal(normal, alpha):
-    return np.concatenate([render(normal, albedo=[0.0], alpha=alpha, f0=f, lights=LIGHTS) for f in GOLD])
+def metal(normal, alpha, lights=LIGHTS):
+    return np.concatenate([render(normal, albedo=[0.0], alpha=alpha, f0=f, lights=lights) for f in GOLD])
 
 
 def border(share, *, metal_rough=0.3, paint_rough=0.5, noise=0.0):
