@@ -20,39 +20,35 @@ CONTINUES = 0.5
 """Least cosine between the normals of neighbours that are one surface; beyond lies an edge."""
 
 
-def turns_within(pixels: np.ndarray, normal: np.ndarray, places: Callable[[np.ndarray], np.ndarray], inside: np.ndarray,
+def turns_within(pixels: np.ndarray, values: Callable[[np.ndarray], np.ndarray], normal: np.ndarray, inside: np.ndarray,
                  part: np.ndarray) -> np.ndarray:
-    """Return how normals and places change across pixels [n], row-major positions: [2, n, 6] along a row, and down a column.
+    """Return how a quantity changes across pixels [n], row-major positions: [2, n, 3] along a row, and down a column.
 
     Args:
+        values: returns the quantity [m, 3] of pixels [m].
         normal: [rows, cols, 3] unit normals.
-        places: returns the points [m, 3] that pixels [m] show.
         inside: [rows, cols] bool, where there are any.
         part: [rows, cols] the part of the object that a pixel belongs to: no surface is continued beyond it.
     """
     rows, cols = inside.shape
     flat, there, parts = normal.reshape(-1, 3), inside.reshape(-1), part.reshape(-1)
-    own = np.concatenate([flat[pixels], places(pixels)], axis=1)
-    turns = np.zeros((2, len(pixels), 6), np.float32)
+    own, facing = values(pixels), flat[pixels]
+    turns = np.zeros((2, len(pixels), 3), np.float32)
     for turn, step, at, last in ((turns[0], 1, pixels % cols, cols - 1), (turns[1], cols, pixels // cols, rows - 1)):
         sides = np.zeros(len(pixels), np.float32)
         for way in (-1, 1):
             beside = np.clip(pixels + way * step, 0, rows * cols - 1)
-            other = np.concatenate([flat[beside], places(beside)], axis=1)
             continued = ((at != (last if way > 0 else 0)) & there[beside] & (parts[beside] == parts[pixels])
-                         & ((other[:, :3] * own[:, :3]).sum(axis=1) > CONTINUES))
-            turn += np.where(continued[:, None], way * (other - own), 0)
+                         & ((flat[beside] * facing).sum(axis=1) > CONTINUES))
+            turn += np.where(continued[:, None], way * (values(beside) - own), 0)
             sides += continued
         turn /= np.maximum(sides, 1)[:, None]
     return turns
 
 
-def surface_within(normal: np.ndarray, place: np.ndarray, turns: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield unit normals and points, [n, 3] each, at several places of pixels; `normal` and `place` are those in their middle, and `turns`
-    those of turns_within."""
-    offsets = (np.arange(SIDE, dtype=np.float32) + 0.5) / SIDE - 0.5
+def places_within() -> Iterator[tuple[float, float]]:
+    """Yield the places within a pixel at which it is lit: parts of it to the right of its middle, and below."""
+    offsets = (np.arange(SIDE) + 0.5) / SIDE - 0.5
     for along in offsets:
         for down in offsets:
-            change = along * turns[0] + down * turns[1]
-            moved = normal + change[:, :3]
-            yield moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-6), place + change[:, 3:]
+            yield float(along), float(down)

@@ -19,7 +19,7 @@ from kernels.relight.model.sources import Sources
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.surface.shadows import extent_of
-from service.relight.footprint import NARROW, surface_within, turns_within
+from service.relight.footprint import NARROW, places_within, turns_within
 from service.solve.base.batches import view_directions
 from service.solve.height.height import projection_of
 from service.solve.height.thickness import guess_thickness
@@ -170,18 +170,24 @@ class SurfaceModel:
         assert self.maps.normal is not None
         count = len(batch.pixels)
         lit = to_numpy(shade(batch.surface, light, visible))[:, :count]
-        turns = turns_within(batch.pixels, self.maps.normal, self.places, self._inside, self._part)
-        narrow = np.flatnonzero((turns[..., :3] ** 2).sum(axis=(0, 2)) > (NARROW * self._lobes(batch.pixels).narrowest) ** 2)
+        turns = turns_within(batch.pixels, self.normals, self.maps.normal, self._inside, self._part)
+        narrow = np.flatnonzero((turns**2).sum(axis=(0, 2)) > (NARROW * self._lobes(batch.pixels).narrowest) ** 2)
         if not len(narrow):
             return lit
         pixels, profile = batch.pixels[narrow], None if batch.profile is None else batch.profile[narrow]
+        normal, place, turned = self.normals(pixels), self.places(pixels), turns[:, narrow]
+        moved = turns_within(pixels, self.places, self.maps.normal, self._inside, self._part)
         kind = visible.dtype
         padded = narrow[np.minimum(np.arange(-(-len(narrow) // kind._length_) * kind._length_), len(narrow) - 1)]
         seen = wp.array(to_numpy(visible).reshape(len(visible), visible.shape[1] * kind._length_)[:, padded].reshape(
             len(visible), -1, kind._length_), dtype=kind, device=self.device)
-        places = [to_numpy(shade(self._surface(pixels, *there, profile), light, seen))[:, : len(narrow)]
-                  for there in surface_within(self.normals(pixels), self.places(pixels), turns[:, narrow])]
-        lit[:, narrow] = np.mean(places, axis=0)
+        within = []
+        for along, down in places_within():
+            turning = normal + along * turned[0] + down * turned[1]
+            turning /= np.maximum(np.linalg.norm(turning, axis=1, keepdims=True), 1e-6)
+            surface = self._surface(pixels, turning, place + along * moved[0] + down * moved[1], profile)
+            within.append(to_numpy(shade(surface, light, seen))[:, : len(narrow)])
+        lit[:, narrow] = np.mean(within, axis=0)
         return lit
 
     def places(self, pixels: np.ndarray) -> np.ndarray:

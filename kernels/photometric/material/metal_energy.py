@@ -47,11 +47,11 @@ def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarra
         lobe, rise = _lobe(normal[mine], toward[:, mine], view[mine], float(materials[number, 3]))
         risen, level = ((seen * part).sum(axis=2, dtype=np.float64) for part in (lobe * rise, lobe * (1 - rise)))
         given = (seen * readings[:, mine]).sum(axis=2, dtype=np.float64) - risen
-        f0 = given.sum(axis=1) / np.maximum(level.sum(axis=1), 1e-12)
+        f0 = np.minimum(given.sum(axis=1) / np.maximum(level.sum(axis=1), 1e-12), 1)
         ratio = f0.sum() / float(materials[number, :3].sum(dtype=np.float64))
         off = (given - f0[:, None] * level).sum(axis=0)
         error = np.sqrt((off**2).sum()) / max(float((materials[number, :3] @ level).sum()), 1e-12)
-        if ratio > max(LEAST_RATIO, 1 + SURE * error) and f0.max() <= 1:
+        if ratio > max(LEAST_RATIO, 1 + SURE * error):
             found[number] = [*f0, materials[number, 3] * ratio**-0.25]
     return found
 

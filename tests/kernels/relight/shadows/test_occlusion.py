@@ -185,3 +185,20 @@ def test_no_light_has_no_rows(device):
 def test_positions_outside_the_picture_are_refused(pixels, device):
     with pytest.raises(ArrayError, match="pixels must be positions from 0 to 4095, one or more"):
         seen([far(1, 0, 1)], np.array(pixels, dtype=int), block(), flat(), device)
+
+
+def test_what_lies_within_the_thickness_of_a_part_hides_light(device):
+    """Lines to a lamp that stands level run 5 pixels behind the front of a plate: a plate of 4 pixels lets them pass, one of 6 does not,
+    and neither does one of which nothing is known but that it is the wall's own part."""
+    height, part = block(), np.ones((SIDE, SIDE), np.uint8)
+    part[BLOCK] = 2
+    place = [[1000.0, 0.0, HEIGHT - 5, 1.0]]
+    pixels = SIDE // 2 * SIDE + np.arange(36, 39)  # left of the plate, where the wall is raised so that lines are level
+    height[:, :39] = HEIGHT - 5
+    args = (wp.array(height, dtype=wp.float32, device=device), wp.array(part, dtype=wp.uint8, device=device), flat())
+    for thickness, hidden in ((4.0, False), (6.0, True), (None, False)):
+        given = None if thickness is None else wp.array(np.full(height.shape, thickness), dtype=wp.float32, device=device)
+        got = devices.to_numpy(see_lights(np.array(place), pixels, *args, thickness=given, device=device)).reshape(1, -1)[:, :3]
+        assert (got == (0 if hidden else 255)).all(), thickness
+    alone = seen(place, pixels, height, flat(), device)[0]
+    assert not alone.any()
