@@ -24,12 +24,12 @@ def guess_thickness(surface: np.ndarray, part: np.ndarray, facing: np.ndarray, p
     framed = np.pad(part, 1, constant_values=-1)
     inner = np.logical_and.reduce([framed[1:-1, 1:-1] == side for side in (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2],
                                                                            framed[1:-1, 2:])])
-    cells = np.stack([*np.indices(part.shape), np.ones(part.shape)], axis=-1)
     for number in np.unique(part[part >= 0]):
         mine = part == number
-        outline = mine & ~inner
-        turned = np.clip(facing[outline], STEEPEST, 1)
+        places, outline, height = np.argwhere(mine), ~inner[mine], surface[mine]
+        cells = np.column_stack([places, np.ones(len(places))])
+        turned = np.clip(facing[mine][outline], STEEPEST, 1)
         before = np.where(turned < TURNED_AWAY, np.sqrt(1 - turned**2) / turned, 0) * pixel
-        level = cells[mine] @ np.linalg.lstsq(cells[outline], surface[outline] - before, rcond=None)[0]
-        out[mine] = 2 * np.maximum(surface[mine] - level, 0)
+        level = cells @ np.linalg.lstsq(cells[outline], height[outline] - before, rcond=None)[0]
+        out[mine] = 2 * np.maximum(height - level, 0)
     return out
