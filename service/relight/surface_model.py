@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels import packs
 from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.relight.model.shading import PLANES, SecondLobe, Surface, shade, upload_surface
@@ -177,16 +178,14 @@ class SurfaceModel:
         pixels, profile = batch.pixels[narrow], None if batch.profile is None else batch.profile[narrow]
         normal, place, turned = self.normals(pixels), self.places(pixels), turns[:, narrow]
         moved = turns_within(pixels, self.places, self.maps.normal, self._inside, self._part)
-        kind = visible.dtype
-        padded = narrow[np.minimum(np.arange(-(-len(narrow) // kind._length_) * kind._length_), len(narrow) - 1)]
-        seen = wp.array(to_numpy(visible).reshape(len(visible), visible.shape[1] * kind._length_)[:, padded].reshape(
-            len(visible), -1, kind._length_), dtype=kind, device=self.device)
+        seen = packs.zeros(len(narrow), wp.uint8, self.device, rows=visible.shape[0])
+        packs.take_columns(packs.as_pixels(visible), wp.array(narrow, dtype=wp.int32, device=self.device), 0, seen)
         within = []
         for along, down in places_within():
             turning = normal + along * turned[0] + down * turned[1]
             turning /= np.maximum(np.linalg.norm(turning, axis=1, keepdims=True), 1e-6)
             surface = self._surface(pixels, turning, place + along * moved[0] + down * moved[1], profile)
-            within.append(to_numpy(shade(surface, light, seen))[:, : len(narrow)])
+            within.append(to_numpy(shade(surface, light, packs.as_packs(seen, self.device)))[:, : len(narrow)])
         lit[:, narrow] = np.mean(within, axis=0)
         return lit
 

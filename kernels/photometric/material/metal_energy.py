@@ -11,7 +11,7 @@ Source: the energy of a lobe is that of its mean over normals (Olano and Baker, 
 
 import numpy as np
 
-from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, fit_given, fit_material
+from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, Material, fit_given
 from kernels.photometric.model.samples import Samples, host_values, to_host
 from kernels.photometric.search.hypotheses import Diffuse
 
@@ -23,19 +23,20 @@ SURE = 3.0
 """Number of standard errors, from pixel to pixel, by which the ratio must exceed 1."""
 
 
-def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarray, *, shape: Diffuse) -> np.ndarray:
-    """Return shared materials [materials, 4], metals with the energy that their readings have; waits for the device.
+def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *,
+                      shape: Diffuse) -> np.ndarray | None:
+    """Return shared materials, metals with the energy that their readings have; None: they have it already. Waits for the device.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
         normal: [n, 3] their unit normals.
         materials: [materials, 4] F0 and roughness of shared_materials.choose_materials.
+        single: what the pixels are made of, one of these materials each.
     """
     metal = np.flatnonzero(materials[:, :3].max(axis=1) > BRIGHTEST_DIELECTRIC)
     if not len(metal):
-        return materials
+        return None
     costs = np.stack([fit_given(samples, normal, material, shape=shape).cost for material in materials])
-    single = fit_material(samples, normal, shape=shape, shared=materials)
     nearest, bare = costs.argmin(axis=0), single.specular.max(axis=1) > BRIGHTEST_DIELECTRIC
     readings, toward = (np.stack([host_values(samples, plane[c]) for c in range(3)]) for plane in (samples.colour, samples.toward))
     view, found = to_host(samples, samples.view), materials.copy()
@@ -53,7 +54,7 @@ def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarra
         error = np.sqrt((off**2).sum()) / max(float((materials[number, :3] @ level).sum()), 1e-12)
         if ratio > max(LEAST_RATIO, 1 + SURE * error):
             found[number] = [*f0, materials[number, 3] * ratio**-0.25]
-    return found
+    return None if (found == materials).all() else found
 
 
 def _lobe(normal: np.ndarray, toward: np.ndarray, view: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:

@@ -237,10 +237,12 @@ class _Walk:
         light.keep(spread, samples)
         # the first search saw bounced light, and a lobe would explain what its normals do not
         normal = find_normals(samples, self.result.normal[:, spread].T, shape=self._shape, sweep=QUICK).best.normal
-        materials = with_whole_energy(samples, normal, choose_materials(samples, normal, shape=self._lobe), shape=self._lobe)
+        materials = choose_materials(samples, normal, shape=self._lobe)
+        single = fit_material(samples, normal, shape=self._lobe, shared=materials)
+        if (brighter := with_whole_energy(samples, normal, materials, single, shape=self._lobe)) is not None:
+            materials, single = brighter, fit_material(samples, normal, shape=self._lobe, shared=brighter)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
-        single = fit_material(samples, normal, shape=self._lobe, shared=materials)
         if self._options.metals:
             self._metals = metals_of(materials, single)
         if self._options.mixtures:

@@ -16,6 +16,17 @@ def text(*numbers):
     return ",".join(f"{number:.9g}" for number in np.ravel(np.concatenate([np.atleast_1d(n) for n in numbers])))
 
 
+def write_relief(folder, height, **changes):
+    """Write maps of matt heights over a square, whose normals look at the viewer unless they are given; returns the folder."""
+    folder.mkdir()
+    up = np.zeros((*height.shape, 3), np.float32)
+    up[..., 2] = 1
+    camera = Camera(projection="orthographic", resolution=height.shape, pixel_size_m=PIXEL_M)
+    layers = {"normal": up, "diffuse_albedo": up * 0 + 0.5, "height": height, **changes}
+    SurfaceMaps(camera=camera, mask=np.ones(height.shape, bool), **layers).write(folder / MAPS_FILE)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
     return write_maps(tmp_path_factory.mktemp("shade") / "maps", SURFACE)
@@ -76,13 +87,7 @@ def test_a_wall_throws_its_shadow(relit, tmp_path):
     size, wall = 32, slice(14, 17)
     height = np.zeros((size, size), np.float32)
     height[:, wall] = 6 * PIXEL_M
-    camera = Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
-    up = np.zeros((size, size, 3), np.float32)
-    up[..., 2] = 1
-    (tmp_path / "maps").mkdir()
-    SurfaceMaps(camera=camera, mask=np.ones((size, size), bool), normal=up, diffuse_albedo=up * 0 + 0.5, height=height).write(
-        tmp_path / "maps" / MAPS_FILE)
-    relit("shade", tmp_path / "maps", "--light", text([-100, 0, 100], [20000] * 3), "--out", tmp_path / "p.exr")
+    relit("shade", write_relief(tmp_path / "maps", height), "--light", text([-100, 0, 100], [20000] * 3), "--out", tmp_path / "p.exr")
     row = rgb(tmp_path / "p.exr")[16, :, 1]
     lit = 0.5 / np.pi * np.cos(np.pi / 4)
     np.testing.assert_allclose(row[:13], lit, rtol=3e-3)
@@ -188,13 +193,8 @@ def test_light_passes_behind_another_part(relit, tmp_path, apart):
     size, plate = 32, slice(14, 18)
     height, part = np.zeros((size, size), np.float32), np.ones((size, size), np.uint8)
     height[:, plate], part[:, plate] = 12 * PIXEL_M, 2
-    camera = Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
-    up = np.zeros((size, size, 3), np.float32)
-    up[..., 2] = 1
-    (tmp_path / "maps").mkdir()
-    SurfaceMaps(camera=camera, mask=np.ones((size, size), bool), normal=up, diffuse_albedo=up * 0 + 0.5, height=height,
-                part=part if apart else None).write(tmp_path / "maps" / MAPS_FILE)
-    relit("shade", tmp_path / "maps", "--light", text([-100, 0, 15], [20000] * 3), "--out", tmp_path / "p.exr")
+    maps = write_relief(tmp_path / "maps", height, part=part if apart else None)
+    relit("shade", maps, "--light", text([-100, 0, 15], [20000] * 3), "--out", tmp_path / "p.exr")
     row = rgb(tmp_path / "p.exr")[16, :, 1]
     assert (row[20:30] > 0).all() if apart else (row[20:30] == 0).all()
 
@@ -217,12 +217,7 @@ def test_a_part_has_a_back(relit, tmp_path, elevation):
     hidden = np.linalg.norm(wall - (wall @ toward)[..., None] * toward, axis=-1) < radius
     wrong = []
     for part in ((1 + inside).astype(np.uint8), None):
-        maps = tmp_path / f"maps{len(wrong)}"
-        maps.mkdir()
-        SurfaceMaps(camera=Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M),
-                    mask=np.ones((size, size), bool), normal=normal.astype(np.float32),
-                    diffuse_albedo=np.full((size, size, 3), 0.5, np.float32), height=height.astype(np.float32),
-                    part=part).write(maps / MAPS_FILE)
+        maps = write_relief(tmp_path / f"maps{len(wrong)}", height.astype(np.float32), normal=normal.astype(np.float32), part=part)
         (tmp_path / "p.exr").unlink(missing_ok=True)
         relit("shade", maps, "--light", text(toward * 100, [20000] * 3), "--out", tmp_path / "p.exr")
         wrong.append(((rgb(tmp_path / "p.exr")[..., 1] == 0) != hidden)[~inside].sum() / hidden[~inside].sum())
