@@ -4,9 +4,9 @@
     python -m benchmarks.gpu --device cpu   # the same table on the CPU
     python -m benchmarks.gpu --write        # put the table into docs/figures.md
 
-First the kernels are compared with NumPy twins; no speed is printed of a device on which one is wrong. Where torch or the extra `gpu`
-(cuBLAS) is installed, its products of the same stack are timed in the same run. Bytes are those that the work must read or write once;
-`of copy` is their rate over that of a copy on the device. It fits a card of 8 GB and a host of 16 GB.
+First the kernels are compared with NumPy twins; no speed is printed of a device on which one is wrong. Where torch is installed, its
+products of the same stack are timed in the same run. Bytes are those that the work must read or write once; `of copy` is their rate over
+that of a copy on the device. It fits a card of 8 GB and a host of 16 GB.
 """
 
 import argparse

@@ -107,7 +107,7 @@ def one_frame(device: str, scene: Scene) -> Compared:
 def many_frames(device: str, scene: Scene) -> Compared:
     """Weighted sums of the images, several frames at one time."""
     weights = _weights(scene)
-    found = combine_batch(scene.band, weights, with_cublas=False).numpy()[:, :, :PIXELS]
+    found = combine_batch(scene.band, weights).numpy()[:, :, :PIXELS]
     return found, np.einsum("fcl,clp->fcp", weights, scene.images), FLOAT
 
 

@@ -21,7 +21,6 @@ from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.model.samples import gather
 from kernels.photometric.search.hypotheses import Diffuse
 from kernels.photometric.svbrdf import solve_svbrdf
-from kernels.relight.frames import cublas
 from kernels.relight.frames.combine import combine, combine_batch
 from kernels.structured.pattern_frames import upload
 from kernels.structured.phase import decode_phase
@@ -147,13 +146,7 @@ def _stacks(table: Table, rng: np.random.Generator, lights: Lights, few: np.ndar
     table.row("a frame to the host", lambda: target[: 3 * 2].numpy(), pixels, frame)
     weights = rng.random((FRAMES, 3, LIGHTS), dtype=np.float32)
     table.row("relight, 1 frame", lambda: combine(band, weights[0]), pixels, stack + frame)
-    many = FRAMES * pixels, stack + FRAMES * frame
-    table.row(f"relight, {FRAMES} frames", lambda: combine_batch(band, weights, with_cublas=False), *many)
-    name = f"relight, {FRAMES} frames, cuBLAS (extra `gpu`)"
-    if cublas.product_of(device) is None:
-        table.absent(name, "skipped: not on the CPU" if device == "cpu" else f"skipped: {cublas.describe(device).partition(':')[0]}")
-    else:
-        table.row(name, lambda: combine_batch(band, weights), *many)
+    table.row(f"relight, {FRAMES} frames", lambda: combine_batch(band, weights), FRAMES * pixels, stack + FRAMES * frame)
     _torch(table, images, weights)
     table.row("`lambert`", lambda: solve_lambert(band, grey_readings(band, factors), lights.direction), pixels, stack)
     table.row("`robust`", lambda: solve_robust(band, grey_readings(band, factors), lights.direction), pixels, stack)

@@ -211,7 +211,7 @@ class SurfaceModel:
         facing, height = np.zeros(self._inside.size), np.where(self._inside, self.maps.height, -1).astype(np.float64)
         facing[pixels] = (self.normals(pixels) * self._view(pixels)).sum(axis=1)
         pixel = 2 / float(self._projection.scale[0] + self._projection.scale[1])
-        thickness = guess_thickness(-np.log(-height) if perspective else height, np.where(self._inside, self._part, -1).astype(int),
+        thickness = guess_thickness(-np.log(-height) if perspective else height, np.where(self._inside, self._part.astype(int), -1),
                                     facing.reshape(height.shape), pixel)
         return wp.array((thickness * -height if perspective else thickness).astype(np.float32), dtype=wp.float32, device=self.device)
 

@@ -21,7 +21,6 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import to_numpy
-from kernels.relight.frames import cublas
 from service.errors import DivergedError
 from service.reporting.provenance import versions
 from stage.formats.npy import packed, unpacked
@@ -216,8 +215,8 @@ class _Pass:
 
 
 def kind_of_worker(device: str) -> str:
-    """Return what workers have in common that find the same to the last bit: the kind of device, all versions, and cuBLAS."""
-    return digest((devices.kind(device), versions(), cublas.product_of(device) is not None))
+    """Return what workers have in common that find the same to the last bit: the kind of device and all versions."""
+    return digest((devices.kind(device), versions()))
 
 
 def digest(value: object) -> str:

@@ -1,13 +1,13 @@
 """Relighting by linear combination: light is additive, so a new distant illumination is a weighted sum of the captured images.
 
 One frame is memory-bound: the stack is read once. On the CPU a thread takes a chunk of packs whose sums stay in the cache, with the
-lights outermost and four of them a pass, so that the accumulator is read and written a quarter as often. On CUDA a thread takes one pack
-and keeps its sum in registers.
+lights outermost and four of them a pass, so that the accumulator is read and written a quarter as often. On CUDA a thread takes one pack,
+keeps its sum in registers, and loads four lights before it adds them.
 
 Many frames are a matrix product of frame weights and the stack. A thread keeps eight frames of one pack in registers. On the CPU it takes a
 chunk of packs, which eight frames after eight read again from the cache, so that the stack is read from memory once and never widened to
-float32 there; on CUDA it takes one pack, or cuBLAS makes the product where it is installed (cublas.py). The sum of a frame in registers
-adds its lights one after another, and is the same to the last bit whichever other frames are made.
+float32 there; on CUDA it takes one pack. The sum of a frame in registers adds its lights one after another, and is the same to the last
+bit whichever other frames are made.
 
 Source: Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.3.
 """
@@ -21,15 +21,14 @@ from kernels import device as devices
 from kernels.device import once, to_numpy
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load, pack_store
-from kernels.packs import Band, as_packs, new_array, pack_type, zeros
-from kernels.relight.frames import cublas
+from kernels.packs import Band, as_packs, new_array, pack_type, unwritten
 
 FRAME_CHUNK = 1024
 """Packs of one frame that one CPU thread sums. They are 64 KiB of each light's row, long enough for the hardware prefetcher, and their
 sums, 128 KiB, stay in the second-level cache. With 64 packs, whose sums would fit the first level, one core is 1.6 times slower."""
 LIGHTS_PER_PASS = 4
-"""Number of lights that one pass adds, so that the accumulator is read and written a quarter as often; it divides the light padding of
-8."""
+"""Number of lights that one pass adds: on the CPU the accumulator is read and written a quarter as often, on CUDA four loads are under way
+at one time. It divides the light padding of 8."""
 BATCH_CHUNK = 8
 """Packs of many frames that one CPU thread takes: 256 pixels of 64 lights are 32 KiB, which the first-level cache holds."""
 GROUP = 32
@@ -48,7 +47,7 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
     _check_weights(weights, (3, band.frame_count))
     device = band.device
     pack = devices.pack_width(device)
-    frame = zeros(band.pixel_count, wp.float32, device, rows=3)
+    frame = unwritten(band.pixel_count, wp.float32, device, rows=3)
     on_device = wp.array(weights, dtype=wp.float32, device=device)
     if device == "cpu":
         chunks = -(-band.packs // FRAME_CHUNK)
@@ -58,12 +57,11 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
     return frame
 
 
-def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) -> wp.array:
+def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
     """Relight many frames: return weighted sums of the stored images, [frames, 3, pixels padded] float32; not synchronised on CUDA.
 
     Args:
         weights: [frames, 3, lights] float32; 0 for padded lights.
-        with_cublas: whether cuBLAS makes them on CUDA where it is installed. The last bits differ.
     """
     band.require_channels(3)
     _check_weights(weights, (len(weights), 3, band.frame_count))
@@ -73,8 +71,6 @@ def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) 
     if not len(weights):
         return wp.empty((0, 3, band.packs * pack), dtype=wp.float32, device=device)
     if device != "cpu":
-        if with_cublas and (gemm := cublas.product_of(device)) is not None:
-            return cublas.combine_by(gemm, band, weights)
         return sum_rows(band.values, upload_weights(weights, device))[: len(weights)]
     padded = _padded(weights, REGISTER_FRAMES)
     groups = np.ascontiguousarray(padded.reshape(-1, REGISTER_FRAMES, 3, band.frame_count).transpose(0, 2, 3, 1))
@@ -187,7 +183,7 @@ def frame_register_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def combine_register(first: int,
-                         values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
+                         values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance; L a multiple of 4
                          weights: wp.array2d(dtype=float),  # [3, L]
                          # outputs
                          frame: wp.array2d(dtype=float_pack)):  # [3, P]
@@ -195,12 +191,20 @@ def frame_register_kernel(pack: int) -> Any:
         packs = values.shape[1]
         channel = thread / packs
         p = thread % packs
+        row = channel * weights.shape[1]
         total = float_pack()
-        for light in range(weights.shape[1]):
-            value = load(values, channel * weights.shape[1] + light, p)
-            w = weights[channel, light]
+        for group in range(weights.shape[1] / LIGHTS_PER_PASS):
+            light = group * LIGHTS_PER_PASS
+            v0 = load(values, row + light, p)
+            v1 = load(values, row + light + 1, p)
+            v2 = load(values, row + light + 2, p)
+            v3 = load(values, row + light + 3, p)
+            w0 = weights[channel, light]
+            w1 = weights[channel, light + 1]
+            w2 = weights[channel, light + 2]
+            w3 = weights[channel, light + 3]
             for k in range(pack):
-                total[k] += float(value[k]) * w
+                total[k] += float(v0[k]) * w0 + float(v1[k]) * w1 + float(v2[k]) * w2 + float(v3[k]) * w3
         store(frame, channel, p, total)
 
     return combine_register

@@ -48,16 +48,12 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
         import numpy as np
 
         from kernels import device, packs
-        from kernels.relight.frames import cublas
         from kernels.relight.frames.combine import combine
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
             sound = bool((device.to_numpy(combine(band, np.full((3, 8), 0.25, dtype=np.float32))) == 2.0).all())
             print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")
-            if name != "cpu":
-                print(f"{'cuBLAS':<12} {name}: {cublas.describe(name)}")
-                faults += _wrong_products(name)
             if not sound:
                 faults.append(f"{name} gives wrong sums")
         if os.environ.get("RELIT_KERNELS") and not device.MADE_AHEAD.is_dir():
@@ -98,25 +94,6 @@ def kernels(
         made = ahead.build(folder, arch, show)
     print(f"{folder}: {len(made)} kernels for {', '.join(f'sm_{each}' for each in dict.fromkeys(arch))}, "
           f"{sum(path.stat().st_size for path in made) / 1e6:.1f} MB")
-
-
-def _wrong_products(device: str) -> list[str]:
-    """Compare batches of frames by cuBLAS with those by the kernel of relit, where both are there; return what is wrong."""
-    import numpy as np
-
-    from kernels import packs
-    from kernels.device import to_numpy
-    from kernels.relight.frames import cublas
-    from kernels.relight.frames.combine import combine_batch
-
-    if cublas.product_of(device) is None:
-        return []
-    rng = np.random.default_rng(0)
-    band = packs.upload(rng.random((3, 16, 256)).astype(np.float16), device=device)
-    weights = rng.random((40, 3, 16), dtype=np.float32)
-    theirs, ours = (to_numpy(combine_batch(band, weights, with_cublas=which)) for which in (True, False))
-    agree = np.allclose(theirs, ours, rtol=cublas.TOLERANCE, atol=0)
-    return [] if agree else [f"{device}: cuBLAS gives wrong sums: uninstall nvmath-python"]
 
 
 def _service(data: Path | None, config: Path | None) -> list[str]:
