@@ -31,7 +31,7 @@ FLAGS = {SATURATED: ("saturated", "The reading saturates, or alignment lost it: 
          HIDDEN: ("shadowed", "The solved surface hides the light from this pixel."),
          BACKLIT: ("backlit", "The light comes from behind the surface.")}
 """Bits of `used`, their names and meanings."""
-MODEL_LAYERS = ("normal", "diffuse_albedo", "height", "abundance", *(name for lobe in LOBES for name in lobe))
+MODEL_LAYERS = ("normal", "diffuse_albedo", "height", "part", "abundance", *(name for lobe in LOBES for name in lobe))
 
 
 class PixelGrid(NamedTuple):
@@ -110,6 +110,8 @@ def _surface(found: ResultLayers, grid: PixelGrid, device: str) -> SurfaceModel 
         if name in names:
             values = found.take(name)
             layers[name] = values[0] if len(values) == 1 else np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    if "part" in layers:
+        layers["part"] = layers["part"].astype(np.uint8)
     found.forget()
     return SurfaceModel(SurfaceMaps(camera=found.camera, mask=found.estimated, **layers), found.path, device, chosen=chosen)
 

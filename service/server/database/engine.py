@@ -1,5 +1,6 @@
 """The database: SQLite in the data folder, or PostgreSQL. Transactions can wait while its server restarts."""
 
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -123,6 +124,8 @@ def _sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none fails halfway
     for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
+    if sqlite3.sqlite_version_info < (3, 42):  # DBOS expects that the SQLite of Python 3.12 knows 'subsec'; that of the system may not
+        connection.create_function("unixepoch", 1, lambda _subsec: time.time())
 
 
 def lock_project(connection: sa.Connection, project: str) -> None:

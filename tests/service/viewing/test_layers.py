@@ -178,6 +178,22 @@ def test_near_lights_are_where_they_are(tmp_path):
     np.testing.assert_allclose(found.samples("model")[seen], wanted[seen], rtol=8 * HALF_ROUNDING, atol=1e-5)
 
 
+@pytest.mark.parametrize("apart", [True, False])
+def test_light_passes_behind_another_part(tmp_path, apart):
+    """A plate 12 pixels before a wall, and light that comes level with the gap. Without parts the plate reaches back to the wall."""
+    size, plate = 32, slice(14, 18)
+    scene = make_scene(size, lights=3)
+    write_capture(tmp_path / "cap", scene._replace(mask=np.ones((size, size), bool)))
+    edit_frame(tmp_path / "cap", 1, light={"type": "distant", "direction": [-0.98894, 0, 0.14834], "irradiance": [1, 1, 1]})
+    height, part = np.zeros((size, size), np.float32), np.ones((size, size), np.uint8)
+    height[:, plate], part[:, plate] = 12, 2
+    flat = np.tile(np.array([0, 0, 1], np.float32), (size, size, 1))
+    SurfaceMaps(camera=Capture.open(tmp_path / "cap").camera, mask=np.ones((size, size), bool), normal=flat, diffuse_albedo=0 * flat + 0.5,
+                height=height, part=part if apart else None).write(tmp_path / "maps" / "maps.exr")
+    hidden = show(tmp_path).samples("used")[16, 20:30, 1] & HIDDEN != 0
+    assert not hidden.any() if apart else hidden.all()
+
+
 @pytest.mark.long
 def test_refined_intensities_of_the_solve_light_the_model(tmp_path):
     write_dome(tmp_path / "cap", SURFACE, lights=12)
