@@ -186,7 +186,8 @@ def test_files_that_cannot_be_sent(client: Client, tmp_path: Path):
         client.captures.upload(capture)
     (capture / "more").unlink()
     (tmp_path / "secret.txt").write_text("a key")
-    for target, sentence in ((tmp_path / "secret.txt", "notes.txt: is a link that leads out of"), ("notes.txt", "notes.txt: is a link"),
+    for target, sentence in ((tmp_path / "secret.txt", "notes.txt: is a link that leads out of"),
+                             ("notes.txt", "notes.txt: is (a link|no file)"),  # from Python 3.13 on a circle of links can be followed
                              ("missing.txt", "notes.txt: is no file")):
         (capture / "notes.txt").symlink_to(target)
         with pytest.raises(FileError, match=sentence):
