@@ -40,13 +40,14 @@ class Shapes(NamedTuple):
     """The shape of least cost, under which materials are fitted."""
     mean: Diffuse
     """The mean of the shapes that cost little, under which normals are found: a wrong shape bends them, and the mean errs less."""
-    tried: np.ndarray  # [shapes, 3] float64: roughness, slope, mean cost of each
+    tried: dict[Diffuse, float]
+    """The mean cost of each shape."""
 
 
-def choose_diffuse(samples: Samples, start: np.ndarray) -> Shapes:
+def choose_diffuse(samples: Samples, start: np.ndarray, *, beside: Diffuse | None = None) -> Shapes:
     """Choose the shape of the diffuse lobe from some hundreds of pixels, spread over the object; waits for the device.
 
-    `start` is [n, 3] unit normals to begin from.
+    `start` is [n, 3] unit normals to begin from. `beside` is a further shape that is tried.
     """
     lambert = find_normals(samples, start, shape=Diffuse(), sweep=QUICK).best
     tried: dict[Diffuse, float] = {}
@@ -59,13 +60,15 @@ def choose_diffuse(samples: Samples, start: np.ndarray) -> Shapes:
 
     for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
         judge(rough, slope)
+    if beside is not None:
+        judge(beside.rough, beside.slope)
     best = _best(tried)
     rough_step, slope_step = ROUGHNESSES[2] - ROUGHNESSES[1], SLOPES[1] - SLOPES[0]
     for across, along in itertools.product((-1, 0, 1), repeat=2):
         rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * REFINEMENT * rough_step, 0, 1))
         judge(rough, best.slope + along * REFINEMENT * slope_step)
     best = _best(tried)
-    return Shapes(best, _average(tried, best), np.array([(shape.rough, shape.slope, value) for shape, value in tried.items()]))
+    return Shapes(best, _average(tried, best), tried)
 
 
 def _best(tried: dict[Diffuse, float]) -> Diffuse:

@@ -15,11 +15,9 @@ from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.material.albedo_error import albedo_error
-from kernels.photometric.material.material import MATT, fit_given, fit_material, fit_tinted
-from kernels.photometric.material.metal_energy import with_whole_energy
-from kernels.photometric.material.metal_search import Metals, metals_of
-from kernels.photometric.material.mixtures import HELD, NO_PAIRS, choose_pairs
-from kernels.photometric.material.shared_materials import choose_materials
+from kernels.photometric.material.material import MATT, fit_given, fit_tinted
+from kernels.photometric.material.mixtures import HELD
+from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.descent import descend
@@ -38,14 +36,13 @@ from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.part_scene import Material
 from service.solve.methods.diffuse import APART, pair_starts
+from service.solve.methods.kinds import Kind, Kinds
 from service.solve.methods.settling import as_shown, middles_of, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
 from stage.colour.colour import GREY_WEIGHTS
 
 SPREAD_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
-MATERIAL_PIXELS = 640
-"""Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
 SHARED_PAIRS = 384
 """Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
@@ -90,7 +87,7 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     walk.choose_shape()
     walk.search()
     light = walk.refine_intensities(walk.direct_light())
-    walk.fit(light, walk.choose_materials(light))
+    walk.fit(light, walk.choose_kinds(light))
     return walk.result
 
 
@@ -102,7 +99,7 @@ def refine_material(given: SolveInput, lights: Lights, field: NearField, before:
     walk.resume(before)
     light = walk.direct_light()
     walk.choose_shape(light)
-    walk.fit(light, walk.choose_materials(light))
+    walk.fit(light, walk.choose_kinds(light))
     return walk.result
 
 
@@ -119,8 +116,7 @@ class _Walk:
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._lambertian = np.zeros_like(self.result.normal)
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._lobe, self._supported, self._pairs = Diffuse(), Diffuse(), True, NO_PAIRS
-        self._metals: Metals | None = None
+        self._shape, self._lobe, self._supported = Diffuse(), Diffuse(), True
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -228,28 +224,28 @@ class _Walk:
         self._lights = self._lights._replace(irradiance=irradiance)
         return light.under(self._lights, found.factor)
 
-    def choose_materials(self, light: DirectLight | None) -> np.ndarray | None:
-        """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""
+    def choose_kinds(self, light: DirectLight | None) -> Kinds:
+        """Return the diffuse lobes and the materials that pixels share, without materials where they share none."""
+        kinds = Kinds(Kind(self._shape, self._lobe), self._given.stack.pixel_count)
         if light is None or not (self._options.sharing and self._supported):
-            return None
-        spread = self._solvable[evenly(len(self._solvable), MATERIAL_PIXELS)]
-        samples = self._pick(spread)
-        light.keep(spread, samples)
-        # the first search saw bounced light, and a lobe would explain what its normals do not
-        normal = find_normals(samples, self.result.normal[:, spread].T, shape=self._shape, sweep=QUICK).best.normal
-        materials = choose_materials(samples, normal, shape=self._lobe)
-        single = fit_material(samples, normal, shape=self._lobe, shared=materials)
-        if (brighter := with_whole_energy(samples, normal, materials, single, shape=self._lobe)) is not None:
-            materials, single = brighter, fit_material(samples, normal, shape=self._lobe, shared=brighter)
-        self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
-                                                 for material in materials.round(4).astype(float)]
-        if self._options.metals:
-            self._metals = metals_of(materials, single)
-        if self._options.mixtures:
-            self._pairs = choose_pairs(samples, normal, materials, single, shape=self._lobe)
-        return materials
+            return kinds
 
-    def fit(self, light: DirectLight | None, materials: np.ndarray | None) -> None:
+        def read(pixels: np.ndarray) -> Samples:
+            samples = self._pick(pixels)
+            light.keep(pixels, samples)
+            return samples
+
+        normal, options = self.result.normal, self._options
+        kinds.tell_apart(to_numpy(light.solved).reshape(-1), self._solvable, read, normal)
+        kinds.find_materials(self._solvable, read, normal, metals=options.metals, mixtures=options.mixtures)
+        whole, *others = ({"pixels": int((kinds.which[self._solvable] == number).sum()), **kind.report()}
+                          for number, kind in enumerate(kinds.kinds))
+        self.result.facts["shared_materials"] = whole["shared_materials"]
+        if others:
+            self.result.facts["other_parts"] = others
+        return kinds
+
+    def fit(self, light: DirectLight | None, kinds: Kinds) -> None:
         """Fit normal and material of every pixel to its direct light."""
         result = self.result
         count = self._given.stack.pixel_count
@@ -263,27 +259,31 @@ class _Walk:
         def fit(batch: Batch) -> None:
             pixels, samples = batch
             light_on[samples.device].keep(pixels, samples)
+            for at, kind, first_pair in kinds.groups(pixels):
+                fit_kind(pixels[at], samples if len(at) == len(pixels) else choose(samples, at), kind, first_pair)
+
+        def fit_kind(pixels: np.ndarray, samples: Samples, kind: Kind, first_pair: int) -> None:
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
-            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
-                                 pairs=self._pairs, metals=self._metals, roughness=roughness, prior=self._prior(pixels),
+            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=kind.shape, lobe=kind.lobe, shared=kind.materials,
+                                 pairs=kind.pairs, metals=kind.metals, roughness=roughness, prior=self._prior(pixels),
                                  beside=self._beside(pixels), shared_misfit=shared)
             result.normal[:, pixels] = found.normal.T
-            material = fit_given(samples, found.normal, MATT, shape=self._lobe) if self._matt else found
+            material = fit_given(samples, found.normal, MATT, shape=kind.lobe) if self._matt else found
             result.albedo[:, pixels] = material.diffuse_albedo.T
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
-            error = albedo_error(samples, found.normal, material, shape=self._lobe, shared=MATT[None] if self._matt else materials)
+            error = albedo_error(samples, found.normal, material, shape=kind.lobe, shared=MATT[None] if self._matt else kind.materials)
             own[:, pixels], tilt[:, pixels] = (np.minimum(each.T, np.finfo(np.float16).max) for each in error)
             abundance[pixels], pair[pixels] = found.mixture
+            pair[pixels[found.mixture.abundance > 0]] += np.uint8(first_pair)
             sigma[pixels], result.residual[pixels] = found.sigma, found.residual
 
         self._batches("normals", fit, Results(
             (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt),
-            (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals,
-             shared)))
+            (None if light is None else light.found, kinds.which, kinds.kinds, self._supported, shared)))
         result.shared_misfit, result.albedo_own, result.albedo_tilt = shared, own, tilt
         if (mixed := abundance > 0).any():
-            result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
+            result.abundance, result.pair, result.pairs = abundance, pair, kinds.pairs
             result.facts["mixed_pixels"] = int(mixed.sum())
 
     def _shared_misfit(self, light: DirectLight | None) -> float:
