@@ -110,7 +110,7 @@ def predict(left: LeftOut, weights: LightWeights | None, *, guided: bool) -> np.
     work = left.folder.parent
     maps = work / "maps" if guided else None
     if maps is not None and not (maps / MAPS_FILE).exists():
-        solve(SolveRequest(capture=left.folder, out=maps, method=Method.SVBRDF, cache=work))
+        solve(SolveRequest(capture=left.folder, out=maps, method=Method.SVBRDF, cache=work, albedo_scale=1.0))  # in the unit of the images
     name = "guided" if guided else str(weights)
     result = relight(RelightRequest(capture=left.folder, keys=work / "keys.json", frames=f"1-{len(left.wanted)}", weights=weights,
                                     maps=maps, out=str(work / f"{name}.##.exr"), cache=work, overwrite=True))

@@ -154,6 +154,7 @@ class SurfaceModel:
         specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
         if maps.specular is not None and maps.roughness is not None:
             specular, roughness = self._rows(maps.specular, pixels), self._rows(maps.roughness, pixels)
+            specular = np.maximum(specular, 0)  # maps of relit 0.2.0 or of other programs may be a little below
         if maps.abundance is None:
             return Lobes(specular, roughness, None)
         layers = (maps.first_specular, maps.first_roughness, maps.second_specular, maps.second_roughness)

@@ -71,13 +71,16 @@ def scale_albedo(solution: Solution, request: SolveRequest, brighter: float, ove
         chosen = over_time.share_albedo_scale(chosen)
     factor = np.float32(chosen * brighter)
     solution.albedo = (solution.albedo * factor).astype(np.float16)
-    for name in ("specular", "albedo_own", "albedo_tilt"):
+    for name in ("albedo_own", "albedo_tilt"):
         values = getattr(solution, name)
         if values is not None:
             setattr(solution, name, (values * factor).astype(np.float16))
+    # no surface reflects more than all light, though single pixels seemed brighter than the others say
+    if solution.specular is not None:
+        solution.specular = np.minimum(solution.specular * factor, 1).astype(np.float16)
     if solution.pairs is not None:
         solution.pairs = solution.pairs.copy()
-        solution.pairs[..., :3] *= factor
+        solution.pairs[..., :3] = np.minimum(solution.pairs[..., :3] * factor, 1)
     solution.facts["albedo_factor"] = float(f"{chosen:.6g}")
     return float(solution.facts["albedo_factor"])
 

@@ -126,4 +126,9 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     group = devices.Repeated(steps, device)
     for _ in range(GROUPS):
         group.run()
-    return np.ascontiguousarray(grid.pixels(to_numpy(found)))
+    said = values[:, trust > 0]
+    if not said.size:
+        return values.astype(np.float32)
+    # the minimum takes no value beyond those that pixels say; steps towards it may
+    least, most = (limit(axis=1)[:, None, None].astype(np.float32) for limit in (said.min, said.max))
+    return np.clip(grid.pixels(to_numpy(found)), least, most)

@@ -29,9 +29,9 @@ POOL = 2
 """Half-width, in pixels, of the window over which the sums of β are pooled."""
 POOLED_ROWS = 64
 """Rows of an image that a thread pools at one time."""
-LEAST_ALPHA = 0.3
-"""Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights: α is about half a lobe's width at half its height,
-and between two lights the half vector moves by half of the angle between them (docs/figures.md)."""
+LEAST_ALPHA = 0.15
+"""Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights: between two of them the half vector moves by half of
+the angle, and a lobe of a third of that is seen by one light in some pixels and by two in others (docs/methods.md)."""
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
