@@ -30,8 +30,8 @@ POOL = 2
 POOLED_ROWS = 64
 """Rows of an image that a thread pools at one time."""
 LEAST_ALPHA = 0.15
-"""Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights: between two of them the half vector moves by half of
-the angle, and a lobe of a third of that is seen by one light in some pixels and by two in others (docs/methods.md)."""
+"""Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights. Between two of them the half vector moves by half
+of the angle: one light sees a lobe of a third of that in some pixels, and two in others (docs/methods.md)."""
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
