@@ -119,6 +119,50 @@ def _glaze(p: np.ndarray) -> Paint:
     return Paint(np.tile([0.66, 0.42, 0.30], (count, 1)), np.full((count, 3), 0.6), np.full(count, 0.45), np.zeros(count))
 
 
+def _vase(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a vase with a neck, turned about y."""
+    x, y, z = np.moveaxis(p - [1.6, -0.5, -2.0], -1, 0)
+    bulges = ((2.2, -2.5, 3.0), (-0.9, 4.2, 1.6), (0.5, 7.4, 0.8))
+    profile = 2.4 + sum(wide * np.exp(-(((y - at) / long) ** 2)) for wide, at, long in bulges)
+    return np.maximum(0.75 * (np.hypot(x, z) - profile), np.abs(y - 0.3) - 7.2) - 0.15
+
+
+def _glazed_bands(p: np.ndarray) -> Paint:
+    bands = smoothstep(-0.15, 0.15, np.sin(1.1 * p[..., 1] + 0.6 * np.sin(p[..., 0])))
+    colour = mix(np.array([0.06, 0.20, 0.10]), np.array([0.72, 0.64, 0.50]), bands)
+    return Paint(colour, np.full((len(p), 3), 0.6), 0.18 + 0.22 * smoothstep(-1.0, 1.0, noise(p, 4.0, seed=51)), np.zeros(len(p)))
+
+
+def _box(p: np.ndarray, half: tuple[float, float, float], rounding: float) -> np.ndarray:
+    q = np.abs(p) - np.array(half)
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) - rounding
+
+
+def _plate(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a plate that leans, left of the vase and before it."""
+    axis = np.array([0.45, 0.25, 0.86]) / np.linalg.norm([0.45, 0.25, 0.86])
+    side = np.cross(axis, [0, 1, 0])
+    side /= np.linalg.norm(side)
+    return _box((p - [-4.6, -3.4, 4.0]) @ np.stack([side, np.cross(side, axis), axis], axis=1), (2.2, 2.6, 0.05), 0.35)
+
+
+def _copper_stripes(p: np.ndarray) -> Paint:
+    count, share = len(p), smoothstep(-0.2, 0.2, np.sin(2.2 * (0.8 * p[..., 0] + 0.6 * p[..., 1])))
+    return Paint(np.tile([0.10, 0.10, 0.45], (count, 1)), np.tile([0.86, 0.52, 0.36], (count, 1)), np.full(count, 0.42), share)
+
+
+def _shell(p: np.ndarray) -> Paint:
+    count = len(p)
+    return Paint(np.tile([0.75, 0.73, 0.68], (count, 1)), np.full((count, 3), 0.6), np.full(count, 0.7), np.zeros(count))
+
+
+def _turned_box(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a rounded cube, turned about two axes, at the foot of the vase."""
+    x, y, z = np.moveaxis(p - [3.2, -5.6, 5.2], -1, 0)
+    across, along = np.cos(0.6) * x + np.sin(0.6) * z, np.cos(0.6) * z - np.sin(0.6) * x
+    return _box(np.stack([across, 0.94 * y + 0.34 * along, 0.94 * along - 0.34 * y], axis=-1), (1.0, 1.0, 1.0), 0.5)
+
+
 SCENES: dict[str, dict[str, Part]] = {
     "two_parts": {
         "body": Part(_lumpy, (-9.9, -9.9, -9.0), (8.7, 8.9, 9.0), _lumpy_paint),
@@ -128,6 +172,13 @@ SCENES: dict[str, dict[str, Part]] = {
         "torso": Part(_folded, (-7.6, -10.4, -7.6), (7.6, 9.6, 5.6), _cloth),
         "ring": Part(_ring, (-2.0, -2.7, 3.5), (5.8, 5.1, 9.3), _gold),
         "arm": Part(lambda p: _capsule(p, (-5.6, 1.0, 3.6), (1.6, -5.2, 6.8), 1.25, 0.8), (-7.3, -6.8, 1.9), (3.3, 2.7, 8.4), _glaze),
+    },
+    "still": {
+        "vase": Part(_vase, (-5.0, -9.4, -8.2), (8.2, 9.0, 4.2), _glazed_bands),
+        "plate": Part(_plate, (-8.2, -7.4, 1.2), (-1.0, 0.6, 6.8), _copper_stripes),
+        "egg": Part(lambda p: 0.8 * (np.linalg.norm((p - [3.4, 3.2, 5.6]) * [1.0, 0.78, 1.0], axis=-1) - 1.7),
+                    (1.3, 0.6, 3.5), (5.5, 5.8, 7.7), _shell),
+        "cube": Part(_turned_box, (0.8, -8.2, 2.6), (5.8, -3.0, 7.8), _steel),
     },
 }
 """The parts of each object by name; part.Y of truth.exr counts them from 1."""
