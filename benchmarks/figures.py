@@ -222,6 +222,10 @@ def studio(_: argparse.Namespace) -> list[str]:
     return studio_rows()
 
 
+def products(_: argparse.Namespace) -> None:
+    """Keep the section: `python -m benchmarks.gpu.products FOLDER --write` measures it, on a machine with a GPU."""
+
+
 SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
@@ -235,6 +239,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
     "gpu": ("On a GPU", gpu),
+    "products": ("Products on a GPU", products),
     "estimate": ("Estimate for a GPU", estimate),
     "asked": ("Asked of a device", asked),
     "registers": ("Registers of kernels", registers),
@@ -263,7 +268,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
     parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
     parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py, and "
-                                                           "two_parts and figure of samples/make_parts.py")
+                                                           "two_parts, figure and still of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where about 40 GB may be written and are removed again")
     parser.add_argument("--before", type=Path, help="checkout of an older version, to compare the speed with")
