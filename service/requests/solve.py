@@ -8,9 +8,9 @@ from pydantic import Field
 from service.requests.base.base import CAPTURE, Choice, Request, Role, SequenceRequest, Spelling, StackOptions
 from stage.model import Fraction, Line, Positive
 
-SVBRDF_LIGHTS = 12
-"""From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
-every object tried with eight to 96 lights (docs/figures.md)."""
+SVBRDF_LIGHTS = 8
+"""From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and what eight lights do not tell it is
+unsure, where robust is sure of normals that highlights and bounced light bend (docs/methods.md, Few lights)."""
 
 MAX_SIGMA = 30.0
 """Largest standard error, in degrees, of a normal that counts as solved, unless the request says otherwise: a normal this far off says
