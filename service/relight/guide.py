@@ -266,7 +266,7 @@ class Guide:
             part = slice(done, done + len(batch.pixels))
             visible = self._visible(batch, near.marched)
             wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(1 - fine), near.coarse.scaled(1 - coarse))
-            added = pictures + self.trust[part] * (wanted.sum(axis=0) - told)
+            added = pictures + self.trust[part] * followed(wanted.sum(axis=0) - told, np.minimum(pictures, told), told)
             mirror = wanted[1]
             if fine.any() or coarse.any():
                 wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(fine), near.coarse.scaled(coarse))

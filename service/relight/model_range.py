@@ -201,13 +201,16 @@ def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyo
         trust_beyond: [n] β beyond them; not None where the model has such light.
     """
     mirror = model.gloss * model.ratio
-    change = trust * (model.matt + mirror - model.whole)
-    added = None if model.added is None else model.added.sum(axis=-3)
+    picture = np.maximum(model.whole, 0)  # what the model has in place of the sums
+    if model.added is not None:
+        picture = picture + model.added.sum(axis=-3)
+    if model.beyond is not None:
+        picture = picture + model.beyond.captured
+    # what images have lost by a shadow that the model has elsewhere is not taken from them a second time
+    change = trust * followed(model.matt + mirror - model.whole, np.minimum(plain, picture), picture)
     if model.beyond is not None and trust_beyond is not None:
-        beyond = model.beyond
-        whole = beyond.captured + np.maximum(model.whole, 0)
-        change = change + trust_beyond * followed(beyond.whole - beyond.captured, plain, whole if added is None else whole + added)
-        mirror = mirror + beyond.gloss
+        change = change + trust_beyond * followed(model.beyond.whole - model.beyond.captured, plain, picture)
+        mirror = mirror + model.beyond.gloss
     if model.added is not None:
         mirror = mirror + model.added[..., 1, :, :]
     return change, mirror

@@ -112,18 +112,21 @@ def _correct_kernel(pack: int) -> Any:
                     ratio = mean_ratio(shown_given[f, c, p][k], gloss_given[f, c, p][k])
                     mirror = (gloss[f, c, p][k] + small[s, 3 + c, p][k]) * ratio
                     whole = albedo[k] * told[f, c, p][k] + shown[f, c, p][k]
-                    change = trust[n] * (albedo[k] * matt[f, c, p][k] + small[s, c, p][k] + mirror - whole)
                     added, added_mirror = float(0.0), float(0.0)
                     if added_matt.shape[0] > 0:
                         added_mirror = added_gloss[f, c, p][k]
                         added = albedo[k] * added_matt[f, c, p][k] + added_mirror
+                    inside = float(0.0)
+                    if beyond_matt.shape[0] > 0:
+                        inside = albedo[k] * inside_matt[f, c, p][k] + inside_gloss[f, c, p][k]
+                    picture = inside + wp.max(whole, 0.0) + added
+                    share = wp.where(picture > 0.0, wp.max(plain / picture, 0.0), 0.0)
+                    gain = albedo[k] * matt[f, c, p][k] + small[s, c, p][k] + mirror - whole
+                    change = trust[n] * wp.where(gain < 0.0, gain * wp.min(share, 1.0), gain)
                     if beyond_matt.shape[0] > 0:
                         shine = beyond_gloss[f, c, p][k] + beyond_small[f, 3 + c, p][k]
                         outside = albedo[k] * beyond_matt[f, c, p][k] + beyond_small[f, c, p][k] + shine
-                        inside = albedo[k] * inside_matt[f, c, p][k] + inside_gloss[f, c, p][k]
                         gain = outside - inside
-                        picture = inside + wp.max(whole, 0.0) + added
-                        share = wp.where(picture > 0.0, wp.max(plain / picture, 0.0), 0.0)
                         change += trust_beyond[n] * wp.where(gain < 0.0, gain * share, gain)
                         mirror += shine
                     guided = wp.max(plain + change, wp.min(plain, 0.0))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from service.relight.model_range import LitModel, correction
 from service.reporting.provenance import HASHING
 from stage.stack.ingest import LAYOUT
 from tests.scenes.captures import rgb, write_exr
@@ -57,6 +58,15 @@ def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
     plain = SURFACE.off(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
     guided = SURFACE.off(relight(relit, folder, tmp_path / "b", "--maps", maps), truth)
     assert guided < 1.1 * plain
+
+
+@pytest.mark.parametrize(("plain", "guided"), [(0.5, 0.1), (1.0, 0.2), (1.3, 0.5)])
+def test_what_a_shadow_has_taken_is_not_taken_again(plain, guided):
+    """The model says that the sum of images holds 1 and that the frame holds 0.2, because a shadow falls there. Images that lie in that
+    shadow already, so that their sum is 0.5, are left a fifth; a loss of 0.8 would make the pixel black."""
+    one = np.ones((3, 1))
+    change, _ = correction(LitModel(0.2 * one, 0 * one, one, one, None, None), plain * one, np.ones(1), None)
+    np.testing.assert_allclose(plain + change, guided)
 
 
 def test_diffuse_and_specular_add_up_to_the_beauty(relit, scene, tmp_path):

@@ -18,14 +18,15 @@ def twin(plain, trust, trust_beyond, albedo, small, sums, has_added, has_beyond)
     ratio = np.where(given > 1e-9, sums["shown_given"] / np.where(given > 1e-9, given, 1), 1)
     mirror = (sums["gloss"] + small[:, 3:]) * ratio
     whole = albedo * sums["told"] + sums["shown"]
-    change = trust * (albedo * sums["matt"] + small[:, :3] + mirror - whole)
     added = albedo * sums["added_matt"] + sums["added_gloss"] if has_added else 0
+    inside = albedo * sums["inside_matt"] + sums["inside_gloss"] if has_beyond else 0
+    share = np.maximum(plain / (inside + np.maximum(whole, 0) + added), 0)
+    gain = albedo * sums["matt"] + small[:, :3] + mirror - whole
+    change = trust * np.where(gain < 0, gain * np.minimum(share, 1), gain)
     if has_beyond:
         shine = sums["beyond_gloss"] + sums["beyond_small"][:, 3:]
-        inside = albedo * sums["inside_matt"] + sums["inside_gloss"]
         gain = albedo * sums["beyond_matt"] + sums["beyond_small"][:, :3] + shine - inside
-        picture = inside + np.maximum(whole, 0) + added
-        change = change + trust_beyond * np.where(gain < 0, gain * np.maximum(plain / picture, 0), gain)
+        change = change + trust_beyond * np.where(gain < 0, gain * share, gain)
         mirror = mirror + shine
     if has_added:
         mirror = mirror + sums["added_gloss"]
