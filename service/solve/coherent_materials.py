@@ -25,10 +25,14 @@ COLOUR = 0.3
 """Difference of the logarithms of two colours at which a link has exp(-1/2) of its weight."""
 DARKEST = 0.02
 """Albedo below which colours count as black: differences there are noise."""
+UNSURE_WIDTH = 0.25
+"""Least width α of the lobe of a dielectric over the standard error of its normal, in radians: a narrower lobe shines somewhere else, and
+under a light beside it the pixel would flare up. Metals, whose standard errors are several times too large, keep theirs."""
 
 
 def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int], device: str) -> None:
-    """Replace roughness and F0 of a solution by those that neighbouring pixels agree on; pixels with two materials keep theirs.
+    """Replace roughness and F0 of a solution by those that neighbouring pixels agree on, and widen lobes of dielectrics that are narrower
+    than their normals are sure; pixels with two materials keep theirs.
     `sigma`: [pixels] standard error of the normals as each pixel's own readings show it, degrees. `shape`: rows and columns of the
     image. `device`: as Warp spells it."""
     if solution.roughness is None or solution.specular is None:
@@ -60,5 +64,7 @@ def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, 
         links.append((STRENGTH / np.hypot(*step) * together * np.exp(-0.5 * unlike)).astype(np.float32))
     neutral = (specular == specular[:1]).all()  # no coloured metal: one plane stands for three
     found = least_variation(np.concatenate([image(solution.roughness), specular[:1] if neutral else specular]), trust, links, device=device)
+    lobe = (found[0] > 0) & (found[1:].max(axis=0) <= BRIGHTEST_DIELECTRIC)
+    found[0] = np.where(lobe, np.maximum(found[0], np.sqrt(UNSURE_WIDTH * np.radians(image(sigma)[0]))), found[0])
     for target, planes in ((solution.roughness, found[:1]), (solution.specular, found[1:])):
         target.reshape(-1, *shape)[:, *box] = np.where(known, planes, target.reshape(-1, *shape)[:, *box])
