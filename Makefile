@@ -2,14 +2,12 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# tests of the service wait much of their time, so that three share two cores well; each process loads all modules first. The long ones wait
-# more: for workers, databases and browsers
+# tests of the service wait much of their time, so that three share two cores well; each process loads all modules first
 WORKERS ?= 3
-test-all: WORKERS = 4
 # Python keeps what it compiled, also where an image says that it should not: else every start of a program compiles all of it again
 export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
-PYTEST = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
 EMULATED := OPENBLAS_NUM_THREADS=1 nice $(BIN)/python -m pytest -q -n 2 --device-emulated -m "not long" tests/kernels tests/test_device_ways.py \
   tests/test_gpu_benchmark.py
 
