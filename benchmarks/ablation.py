@@ -20,7 +20,8 @@ from kernels.photometric.svbrdf import SHAPE_TEMPERATURE, average_normals, solve
 from kernels.status import Status
 from service.reporting.progress import Timings
 from service.solve.base.solution import SolveInput
-from service.solve.methods.material import SPREAD_PIXELS, MaterialOptions, solve_material
+from service.solve.methods.kinds import LOBE_PIXELS
+from service.solve.methods.material import MaterialOptions, solve_material
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
 from stage.colour.colour import GREY_WEIGHTS
@@ -45,7 +46,7 @@ class Case:
     channels: tuple[Samples, ...]
     """The same pixels with the readings of one channel as their grey."""
     shape: Diffuse
-    """The shared diffuse shape, chosen on SPREAD_PIXELS of them."""
+    """The shared diffuse shape, chosen on LOBE_PIXELS of them."""
     whole: Callable[[MaterialOptions], np.ndarray]
     """Solves the whole image; [n, 3] of its normals."""
 
@@ -75,7 +76,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     solved = np.flatnonzero(lambert[1] & robust[1])
     samples = _gather(band, solved, lights, factors, stack.light_count)
     channels = tuple(_gather(band, solved, lights, grey_factors(lights, one), stack.light_count) for one in np.eye(3))
-    few = solved[evenly(len(solved), SPREAD_PIXELS)]
+    few = solved[evenly(len(solved), LOBE_PIXELS)]
     shape = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few]).mean
 
     def whole(options: MaterialOptions) -> np.ndarray:

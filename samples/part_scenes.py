@@ -64,6 +64,16 @@ def _join(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
     return np.minimum(a, b) - 0.25 * k * h * h
 
 
+def _metal(colour: list[float], roughness: float) -> Callable[[np.ndarray], Paint]:
+    """Return the paint of a bare metal."""
+    return lambda p: Paint(np.full((len(p), 3), 0.5), np.tile(colour, (len(p), 1)), np.full(len(p), roughness), np.ones(len(p)))
+
+
+def _dielectric(colour: list[float], roughness: float) -> Callable[[np.ndarray], Paint]:
+    """Return the paint of a dielectric of one colour."""
+    return lambda p: Paint(np.tile(colour, (len(p), 1)), np.full((len(p), 3), 0.6), np.full(len(p), roughness), np.zeros(len(p)))
+
+
 def _lumpy(p: np.ndarray) -> np.ndarray:
     """Return the distance to a lumpy body of about 7.5 cm radius."""
     q = p - [-0.6, -0.7, 0]
@@ -78,11 +88,6 @@ def _lumpy_paint(p: np.ndarray) -> Paint:
     across = p @ np.array([0.55, 0.80, 0.24])
     share = smoothstep(-3.4, -2.9, across) * smoothstep(-0.6, -1.5, across)  # a narrow and a wide border, 3 and 6 pixels
     return Paint(colour, np.tile([0.92, 0.74, 0.40], (len(p), 1)), 0.32 + 0.22 * smoothstep(-2, 2, noise(p, 6.0, seed=32)), share)
-
-
-def _steel(p: np.ndarray) -> Paint:
-    count = len(p)
-    return Paint(np.full((count, 3), 0.5), np.tile([0.63, 0.60, 0.57], (count, 1)), np.full(count, 0.36), np.ones(count))
 
 
 def _folded(p: np.ndarray) -> np.ndarray:
@@ -107,16 +112,6 @@ def _ring(p: np.ndarray) -> np.ndarray:
     q = p - [1.9, 1.2, 6.4]
     along = q @ axis
     return np.hypot(np.linalg.norm(q - along[..., None] * axis, axis=-1) - 2.7, along) - 0.62
-
-
-def _gold(p: np.ndarray) -> Paint:
-    count = len(p)
-    return Paint(np.full((count, 3), 0.5), np.tile([0.95, 0.70, 0.30], (count, 1)), np.full(count, 0.28), np.ones(count))
-
-
-def _glaze(p: np.ndarray) -> Paint:
-    count = len(p)
-    return Paint(np.tile([0.66, 0.42, 0.30], (count, 1)), np.full((count, 3), 0.6), np.full(count, 0.45), np.zeros(count))
 
 
 def _vase(p: np.ndarray) -> np.ndarray:
@@ -151,11 +146,6 @@ def _copper_stripes(p: np.ndarray) -> Paint:
     return Paint(np.tile([0.10, 0.10, 0.45], (count, 1)), np.tile([0.86, 0.52, 0.36], (count, 1)), np.full(count, 0.42), share)
 
 
-def _shell(p: np.ndarray) -> Paint:
-    count = len(p)
-    return Paint(np.tile([0.75, 0.73, 0.68], (count, 1)), np.full((count, 3), 0.6), np.full(count, 0.7), np.zeros(count))
-
-
 def _turned_box(p: np.ndarray) -> np.ndarray:
     """Return the distance to a rounded cube, turned about two axes, at the foot of the vase."""
     x, y, z = np.moveaxis(p - [3.2, -5.6, 5.2], -1, 0)
@@ -163,22 +153,24 @@ def _turned_box(p: np.ndarray) -> np.ndarray:
     return _box(np.stack([across, 0.94 * y + 0.34 * along, 0.94 * along - 0.34 * y], axis=-1), (1.0, 1.0, 1.0), 0.5)
 
 
+STEEL = _metal([0.63, 0.60, 0.57], 0.36)
 SCENES: dict[str, dict[str, Part]] = {
     "two_parts": {
         "body": Part(_lumpy, (-9.9, -9.9, -9.0), (8.7, 8.9, 9.0), _lumpy_paint),
-        "ball": Part(lambda p: np.linalg.norm(p - [2.3, 2.6, 9.0], axis=-1) - 2.6, (-0.6, -0.3, 6.1), (5.2, 5.5, 11.9), _steel),
+        "ball": Part(lambda p: np.linalg.norm(p - [2.3, 2.6, 9.0], axis=-1) - 2.6, (-0.6, -0.3, 6.1), (5.2, 5.5, 11.9), STEEL),
     },
     "figure": {
         "torso": Part(_folded, (-7.6, -10.4, -7.6), (7.6, 9.6, 5.6), _cloth),
-        "ring": Part(_ring, (-2.0, -2.7, 3.5), (5.8, 5.1, 9.3), _gold),
-        "arm": Part(lambda p: _capsule(p, (-5.6, 1.0, 3.6), (1.6, -5.2, 6.8), 1.25, 0.8), (-7.3, -6.8, 1.9), (3.3, 2.7, 8.4), _glaze),
+        "ring": Part(_ring, (-2.0, -2.7, 3.5), (5.8, 5.1, 9.3), _metal([0.95, 0.70, 0.30], 0.28)),
+        "arm": Part(lambda p: _capsule(p, (-5.6, 1.0, 3.6), (1.6, -5.2, 6.8), 1.25, 0.8), (-7.3, -6.8, 1.9), (3.3, 2.7, 8.4),
+                    _dielectric([0.66, 0.42, 0.30], 0.45)),
     },
     "still": {
         "vase": Part(_vase, (-5.0, -9.4, -8.2), (8.2, 9.0, 4.2), _glazed_bands),
         "plate": Part(_plate, (-8.2, -7.4, 1.2), (-1.0, 0.6, 6.8), _copper_stripes),
         "egg": Part(lambda p: 0.8 * (np.linalg.norm((p - [3.4, 3.2, 5.6]) * [1.0, 0.78, 1.0], axis=-1) - 1.7),
-                    (1.3, 0.6, 3.5), (5.5, 5.8, 7.7), _shell),
-        "cube": Part(_turned_box, (0.8, -8.2, 2.6), (5.8, -3.0, 7.8), _steel),
+                    (1.3, 0.6, 3.5), (5.5, 5.8, 7.7), _dielectric([0.75, 0.73, 0.68], 0.7)),
+        "cube": Part(_turned_box, (0.8, -8.2, 2.6), (5.8, -3.0, 7.8), STEEL),
     },
 }
 """The parts of each object by name; part.Y of truth.exr counts them from 1."""

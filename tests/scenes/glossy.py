@@ -2,6 +2,7 @@
 relighting and shading are judged on. The dome is convex, so that nothing throws a shadow but attached ones."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,21 +69,30 @@ def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: flo
                noise: float = 0.0) -> np.ndarray:
     """Write the capture, with noise of this part of the brightest reading; returns the directions of its lights, by default evenly over the
     sphere."""
-    folder.mkdir(parents=True)
     directions = sphere_directions(lights) if directions is None else directions
-    frames, random = [], np.random.default_rng(0)
-    for index, direction in enumerate(directions):
+    random = np.random.default_rng(0)
+
+    def seen(direction: np.ndarray) -> np.ndarray:
         image = reflect(surface.normal, direction) * irradiance * surface.mask[..., None]
-        image = np.maximum(image + noise * image.max() * random.normal(size=image.shape), 0) if noise else image
-        write_exr(folder / f"{index:03d}.exr", image)
+        return np.maximum(image + noise * image.max() * random.normal(size=image.shape), 0) if noise else image
+
+    write_lit(folder, surface.mask, directions, seen, irradiance=irradiance)
+    return directions
+
+
+def write_lit(folder: Path, mask: np.ndarray, directions: np.ndarray, seen: Callable[[np.ndarray], np.ndarray], *,
+              irradiance: float) -> None:
+    """Write a capture of distant lights: `seen` is the image [rows, cols, 3] under each of their directions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for index, direction in enumerate(directions):
+        write_exr(folder / f"{index:03d}.exr", seen(direction))
         frames.append({"image": f"{index:03d}.exr",
                        "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [irradiance] * 3}})
-    write_image(folder / "mask.png", (surface.mask * 255).astype(np.uint8))
-    size = len(surface.mask)
+    write_image(folder / "mask.png", (mask * 255).astype(np.uint8))
     manifest = {"schema": "relit.capture/1", "name": "dome", "color_space": "lin_rec709_scene", "mask": "mask.png", "frames": frames,
-                "camera": {"projection": "orthographic", "resolution": [size, size], "pixel_size_m": PIXEL_M}}
+                "camera": {"projection": "orthographic", "resolution": list(mask.shape[::-1]), "pixel_size_m": PIXEL_M}}
     (folder / "capture.json").write_text(json.dumps(manifest))
-    return directions
 
 
 def write_maps(folder: Path, surface: Dome, camera: Camera | None = None, **changes: np.ndarray | str | None) -> Path:

@@ -98,6 +98,9 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     if trust.shape != values.shape[1:] or [link.shape for link in links] != [trust[one].shape for one, _ in sides]:
         raise ArrayError(f"trust is {trust.shape}, links {[link.shape for link in links]}: values are {values.shape}, so give one "
                          "trust for each pixel and one link for each pair of pixels")
+    said = values[:, trust > 0]
+    if not said.size:
+        return values.astype(np.float32)
     planes, rows, cols = values.shape
     grid = make_grid(rows, cols, device)
 
@@ -126,9 +129,6 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     group = devices.Repeated(steps, device)
     for _ in range(GROUPS):
         group.run()
-    said = values[:, trust > 0]
-    if not said.size:
-        return values.astype(np.float32)
     # the minimum takes no value beyond those that pixels say; steps towards it may
     least, most = (limit(axis=1)[:, None, None].astype(np.float32) for limit in (said.min, said.max))
     return np.clip(grid.pixels(to_numpy(found)), least, most)

@@ -25,7 +25,7 @@ from kernels.photometric.search.survey import QUICK
 MATERIAL_PIXELS = 640
 """Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
 LOBE_PIXELS = 384
-"""Most pixels of a part, spread over it, from which its lobe is chosen."""
+"""Most pixels of an object or a part, spread over it, from which the shape of its diffuse lobe is chosen."""
 LEAST_PIXELS, LEAST_SHARE = 192, 0.01
 """Pixels that face the camera, and share of those of the object, that a part has whose lobe is chosen: fewer do not tell shapes apart."""
 MOST_PARTS = 16
@@ -44,9 +44,9 @@ class Kind(NamedTuple):
     """What pixels share."""
 
     shape: Diffuse
-    """Of the diffuse lobe, under which normals are found."""
+    """The shape of the diffuse lobe under which normals are found."""
     lobe: Diffuse
-    """The same, under which materials are fitted."""
+    """The shape under which materials are fitted."""
     materials: np.ndarray | None = None  # [materials, 4] F0 and roughness; None: every pixel has a material of its own
     metals: Metals | None = None
     pairs: np.ndarray = NO_PAIRS  # [pairs, 2, 4] materials that pixels mix
@@ -75,10 +75,7 @@ class Kind(NamedTuple):
 
     def report(self) -> dict[str, object]:
         """Return what the report says of it."""
-        shared = [] if self.materials is None else [{"specular": material[:3].tolist(), "roughness": float(material[3])}
-                                                    for material in self.materials.round(4).astype(float)]
-        return {"diffuse_roughness": None if self.lobe.rough < 0 else self.lobe.rough, "diffuse_slope": self.lobe.slope,
-                "shared_materials": shared}
+        return {**lobe_report(self.lobe), "shared_materials": [] if self.materials is None else material_report(self.materials)}
 
 
 class Kinds:
@@ -128,3 +125,13 @@ class Kinds:
         for number in np.unique(self.which[pixels]):
             yield (np.flatnonzero(self.which[pixels] == number), self.kinds[number],
                    sum(len(kind.pairs) for kind in self.kinds[:number]))
+
+
+def lobe_report(lobe: Diffuse) -> dict[str, float | None]:
+    """Return what the report says of a diffuse lobe: its roughness, None for Lambert's, and its slope."""
+    return {"diffuse_roughness": None if lobe.rough < 0 else lobe.rough, "diffuse_slope": lobe.slope}
+
+
+def material_report(materials: np.ndarray) -> list[dict[str, object]]:
+    """Return what the report says of shared materials, [materials, 4] F0 and roughness."""
+    return [{"specular": material[:3].tolist(), "roughness": float(material[3])} for material in materials.round(4).astype(float)]

@@ -6,6 +6,7 @@ from the height of its normals, the materials that pixels share, and the final s
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -36,13 +37,11 @@ from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.part_scene import Material
 from service.solve.methods.diffuse import APART, pair_starts
-from service.solve.methods.kinds import Kind, Kinds
+from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.settling import as_shown, middles_of, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
 from stage.colour.colour import GREY_WEIGHTS
 
-SPREAD_PIXELS = 384
-"""Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
 SHARED_PAIRS = 384
 """Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
@@ -135,7 +134,7 @@ class _Walk:
         each_band(self._given, self._lights, self._field, begin,
                   Results((self.result.normal, self.result.residual, self.result.status, self._lambertian)))
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
-        self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
+        self._spread = self._solvable[evenly(len(self._solvable), LOBE_PIXELS)] if len(self._solvable) else self._solvable
 
     def resume(self, before: Solution) -> None:
         """Take normals, albedo and roughness of the pixels that are solved from an earlier solution."""
@@ -150,16 +149,13 @@ class _Walk:
         self._given.timings.stage("shape", 1)
         if not len(self._spread):
             return
-        samples, normal = self._pick(self._spread), self.result.normal[:, self._spread].T
-        if light is not None:
-            light.keep(self._spread, samples)
+        samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._few:
             self._supported = supports_lobes(self.result, samples, normal)
         if self._supported:
             shapes = choose_diffuse(samples, normal)
             self._shape, self._lobe = shapes.mean, shapes.best
-            self.result.facts |= {"diffuse_roughness": None if self._lobe.rough < 0 else self._lobe.rough,
-                                  "diffuse_slope": self._lobe.slope, "shapes_tried": len(shapes.tried)}
+            self.result.facts |= {**lobe_report(self._lobe), "shapes_tried": len(shapes.tried)}
 
     def search(self) -> None:
         """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
@@ -208,8 +204,7 @@ class _Walk:
                 and self._given.refine_intensities)
         if light is None or not told:
             return light
-        samples, count = self._pick(self._spread), self._given.stack.light_count
-        light.keep(self._spread, samples)
+        samples, count = self._read(self._spread, light), self._given.stack.light_count
         square = max(self._given.mask.shape) / INTENSITY_SQUARES
         row, col = (np.floor(part / square).astype(int) for part in np.divmod(self._spread, self._given.camera.width))
         start, directions = self.result.normal[:, self._spread].T, self._lights.direction[:count]
@@ -229,13 +224,7 @@ class _Walk:
         kinds = Kinds(Kind(self._shape, self._lobe), self._given.stack.pixel_count)
         if light is None or not (self._options.sharing and self._supported):
             return kinds
-
-        def read(pixels: np.ndarray) -> Samples:
-            samples = self._pick(pixels)
-            light.keep(pixels, samples)
-            return samples
-
-        normal, options = self.result.normal, self._options
+        read, normal, options = partial(self._read, light=light), self.result.normal, self._options
         kinds.tell_apart(to_numpy(light.solved).reshape(-1), self._solvable, read, normal)
         kinds.find_materials(self._solvable, read, normal, metals=options.metals, mixtures=options.mixtures)
         whole, *others = ({"pixels": int((kinds.which[self._solvable] == number).sum()), **kind.report()}
@@ -293,8 +282,7 @@ class _Walk:
         if light is None or not len(start):
             return UNKNOWN_SHARE
         pixels = np.concatenate([start, start + APART])
-        samples = self._pick(pixels)
-        light.keep(pixels, samples)
+        samples = self._read(pixels, light)
         shared = shared_misfit(samples, descend(samples, self.result.normal[:, pixels].T, shape=self._shape), shape=self._shape)
         self.result.facts["shared_misfit"] = round(shared, 4)
         return shared
@@ -318,6 +306,13 @@ class _Walk:
     def _pick(self, pixels: np.ndarray) -> Samples:
         """Return the readings of a few pixels, wherever they lie in the image."""
         return pick_pixels(self._given, self._lights, self._view, pixels, self._field)
+
+    def _read(self, pixels: np.ndarray, light: DirectLight | None) -> Samples:
+        """Return the readings of a few pixels as `_pick` does, in their direct light where that is known."""
+        samples = self._pick(pixels)
+        if light is not None:
+            light.keep(pixels, samples)
+        return samples
 
     def _batches(self, stage: str, work: Callable[[Batch], None], results: Results) -> None:
         """Do the solvable pixels batch by batch, and say how far the stage is."""

@@ -24,6 +24,7 @@ from kernels.status import ESTIMATED
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import SeparatedPairs, Solution, SolveInput
+from service.solve.methods.kinds import MATERIAL_PIXELS, material_report
 from service.solve.methods.pairs import PairFindings, examine_pairs
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
@@ -40,8 +41,6 @@ LEAST_DIFFUSE = 0.1
 where polarisers leak the part ε and nobody says so, 0.04 of usual ones; of a black glossy paint of albedo 0.01 it is 0.25."""
 LEAST_LIGHT = 0.01
 """Mean light of a pixel, over the median of the object, below which nothing is said of its polarisation: both parts are noise."""
-MATERIAL_PIXELS = 640
-"""Pixels, spread over the object, from which the shared specular lobes are chosen."""
 SHADOW_DEPTH = 0.3
 """Diffuse reading over its prediction below which it is in shadow, as in the search for normals."""
 
@@ -146,8 +145,7 @@ def _fit_lobes(given: SolveInput, lights: Lights, field: NearField | None, solut
     spread = pixels[evenly(len(pixels), MATERIAL_PIXELS)]
     samples = pick_pixels(here, lit, view, spread, field)
     materials = choose_materials(samples, solution.normal[:, spread].T, shape=shape)
-    solution.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
-                                          for material in materials.round(4).astype(float)]
+    solution.facts["shared_materials"] = material_report(materials)
     given.timings.stage("highlights", len(pixels))
 
     def fit(batch: Batch) -> None:

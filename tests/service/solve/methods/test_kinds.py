@@ -9,8 +9,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.results.maps import SurfaceMaps
 from tests.reference import microfacet
-from tests.scenes.captures import write_exr, write_image
-from tests.scenes.glossy import PIXEL_M, VIEW, dome, sphere_directions
+from tests.scenes.glossy import VIEW, dome, sphere_directions, write_lit
 
 SURFACE = dome(26)
 GLAZED, MATT = slice(0, 26), slice(30, 56)
@@ -26,19 +25,17 @@ def beside(left, right):
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     folder, random = tmp_path_factory.mktemp("domes"), np.random.default_rng(1)
-    inside, frames = SURFACE.mask[..., None], []
-    for index, direction in enumerate(sphere_directions(64)):
+
+    def seen(direction):
         glazed = (GREEN * microfacet.diffuse(SURFACE.normal, direction, VIEW)[..., None]
                   + microfacet.specular(SURFACE.normal, direction, VIEW, 0.3**2, F0)[..., None])
         matt = (WHITE * microfacet.diffuse(SURFACE.normal, direction, VIEW, MATT_ROUGHNESS)[..., None]
                 + microfacet.specular(SURFACE.normal, direction, VIEW, MATT_ROUGHNESS**2, F0)[..., None])
-        image = beside(glazed * inside, matt * inside)
-        write_exr(folder / f"{index:03d}.exr", np.maximum(image + 0.002 * random.normal(size=image.shape), 0))
-        frames.append({"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [1] * 3}})
-    write_image(folder / "mask.png", (beside(SURFACE.mask, SURFACE.mask) * 255).astype(np.uint8))
-    (folder / "capture.json").write_text(json.dumps({
-        "schema": "relit.capture/1", "name": "domes", "mask": "mask.png", "frames": frames,
-        "camera": {"projection": "orthographic", "resolution": [56, 26], "pixel_size_m": PIXEL_M}}))
+        image = beside(glazed, matt) * mask[..., None]
+        return np.maximum(image + 0.002 * random.normal(size=image.shape), 0)
+
+    mask = beside(SURFACE.mask, SURFACE.mask)
+    write_lit(folder, mask, sphere_directions(64), seen, irradiance=1)
     solve(SolveRequest(capture=folder, method=Method.SVBRDF, out=folder / "maps", device="cpu"))
     return SurfaceMaps.read(folder / "maps" / "maps.exr"), json.loads((folder / "maps" / "report.json").read_text())["found"]
 

@@ -7,8 +7,8 @@ import pytest
 
 from stage.formats import exr
 from tests.reference import microfacet
-from tests.scenes.captures import rgb, write_exr, write_image
-from tests.scenes.glossy import PIXEL_M, VIEW, dome, sphere_directions
+from tests.scenes.captures import rgb
+from tests.scenes.glossy import VIEW, dome, sphere_directions, write_lit
 
 SURFACE = dome(26)
 GOLD, PAINT = np.array([0.95, 0.68, 0.35]), np.array([0.5, 0.3, 0.15])
@@ -28,16 +28,12 @@ def reflect(toward):
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder, random = tmp_path_factory.mktemp("border"), np.random.default_rng(1)
-    frames = []
-    for index, direction in enumerate(sphere_directions(64)):
+
+    def seen(direction):
         image = np.pi * reflect(direction) * SURFACE.mask[..., None]
-        write_exr(folder / f"{index:03d}.exr", np.maximum(image + 0.003 * random.normal(size=image.shape), 0))
-        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [np.pi] * 3}
-        frames.append({"image": f"{index:03d}.exr", "light": light})
-    write_image(folder / "mask.png", (SURFACE.mask * 255).astype(np.uint8))
-    (folder / "capture.json").write_text(json.dumps({
-        "schema": "relit.capture/1", "name": "border", "mask": "mask.png", "frames": frames,
-        "camera": {"projection": "orthographic", "resolution": [26, 26], "pixel_size_m": PIXEL_M}}))
+        return np.maximum(image + 0.003 * random.normal(size=image.shape), 0)
+
+    write_lit(folder, SURFACE.mask, sphere_directions(64), seen, irradiance=np.pi)
     return folder
 
 
