@@ -22,7 +22,7 @@ from stage.results.maps import MAPS_FILE, SurfaceMaps
 PICTURE = Path(__file__).parents[1] / "docs" / "relighting.png"
 GAIN = 4.0
 """The factor by which differences are shown brighter."""
-OBJECTS = ("glossy", "owl", "two_parts", "figure", "still")
+OBJECTS = ("glossy", "owl", "two_parts", "figure", "still", "desk")
 
 
 class Check(NamedTuple):
@@ -98,7 +98,7 @@ def relighting_table(checks: Path | None) -> list[str]:
     """Return the table as lines of Markdown, and write docs/relighting.png when there are checks.
 
     Args:
-        checks: folder with glossy and owl of samples/make_relight_checks.py, and two_parts, figure and still of samples/make_parts.py, as
+        checks: folder with glossy and owl of samples/make_relight_checks.py, and two_parts, figure, still and desk of samples/make_parts.py, as
             far as they are there; None: the shipped sample alone.
     """
     lines = ["Relative RMSE over the object, and total energy divided by that of the truth. `--maps`: guided by maps that `svbrdf` "

@@ -153,6 +153,41 @@ def _turned_box(p: np.ndarray) -> np.ndarray:
     return _box(np.stack([across, 0.94 * y + 0.34 * along, 0.94 * along - 0.34 * y], axis=-1), (1.0, 1.0, 1.0), 0.5)
 
 
+def _in_frame(p: np.ndarray, centre: tuple[float, float, float], up: tuple[float, float, float]) -> tuple[np.ndarray, ...]:
+    """Return x, y and z of points in a frame at `centre` whose y is `up`."""
+    y = np.array(up) / np.linalg.norm(up)
+    x = np.cross(y, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    return tuple(np.moveaxis((p - centre) @ np.stack([x, y, np.cross(x, y)], axis=1), -1, 0))
+
+
+MUG = (-1.2, 0.6, -1.0), (0.05, 0.88, 0.47)
+
+
+def _mug(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a mug that one looks into, its handle on the right."""
+    x, y, z = _in_frame(p, *MUG)
+    radius = np.hypot(x, z)
+    cup = np.maximum(np.maximum(radius - 4.0, np.abs(y) - 4.4), -np.maximum(radius - 3.4, -(y + 3.8)))
+    handle = np.hypot(np.hypot(x - 4.3, y) - 2.3, z) - 0.55
+    return 0.7 * (_join(cup, np.maximum(handle, 3.6 - radius), 0.5) - 0.12)
+
+
+def _half_glazed(p: np.ndarray) -> Paint:
+    x, y, z = _in_frame(p, *MUG)
+    glazed = smoothstep(-1.1, -0.8, y + 0.3 * np.sin(2 * np.arctan2(z, x)))
+    colour = mix(np.array([0.50, 0.27, 0.16]), np.array([0.10, 0.30, 0.42]), glazed)
+    return Paint(colour, np.full((len(p), 3), 0.6), 0.65 - 0.48 * glazed, np.zeros(len(p)))
+
+
+def _coin(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a coin with a rim and three rays, which leans before the mug."""
+    x, y, z = _in_frame(p, (-4.6, -5.6, 4.6), (0.25, 0.30, 0.92))
+    radius = np.hypot(x, z)
+    relief = 0.10 * smoothstep(-0.3, 0.3, np.sin(3 * np.arctan2(z, x)) * np.clip(2.4 - radius, 0, 1)) + 0.12 * smoothstep(2.25, 2.4, radius)
+    return 0.6 * (np.maximum(radius - 2.7, np.abs(y) - 0.22 - relief) - 0.08)
+
+
 STEEL = _metal([0.63, 0.60, 0.57], 0.36)
 SCENES: dict[str, dict[str, Part]] = {
     "two_parts": {
@@ -171,6 +206,14 @@ SCENES: dict[str, dict[str, Part]] = {
         "egg": Part(lambda p: 0.8 * (np.linalg.norm((p - [3.4, 3.2, 5.6]) * [1.0, 0.78, 1.0], axis=-1) - 1.7),
                     (1.3, 0.6, 3.5), (5.5, 5.8, 7.7), _dielectric([0.75, 0.73, 0.68], 0.7)),
         "cube": Part(_turned_box, (0.8, -8.2, 2.6), (5.8, -3.0, 7.8), STEEL),
+    },
+    "desk": {
+        "mug": Part(_mug, (-7.5, -7.5, -8.0), (8.0, 8.0, 6.0), _half_glazed),
+        "coin": Part(_coin, (-8.0, -9.2, 1.6), (-1.2, -2.2, 7.6), _metal([0.95, 0.72, 0.34], 0.3)),
+        "stick": Part(lambda p: _capsule(p, (-8.2, 4.0, 6.5), (3.0, -8.6, 7.2), 0.28, 0.2), (-9.0, -9.4, 5.7), (3.8, 4.8, 8.0),
+                      _dielectric([0.62, 0.50, 0.30], 0.55)),
+        "rubber": Part(lambda p: np.linalg.norm(p - [4.6, -5.6, 5.2], axis=-1) - 2.2, (2.0, -8.2, 2.6), (7.2, -3.0, 7.8),
+                       _dielectric([0.03, 0.03, 0.035], 0.35)),
     },
 }
 """The parts of each object by name; part.Y of truth.exr counts them from 1."""

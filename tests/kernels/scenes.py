@@ -24,12 +24,13 @@ class Solved(NamedTuple):
     across: np.ndarray  # [pixel]
     squares: np.ndarray  # [pixel]
     freedom: np.ndarray  # [pixel]
+    spare: np.ndarray  # [pixel]
     agreeing: np.ndarray  # [pixel]
     weights: np.ndarray  # [light, pixel]
 
     def sigma(self, misfit: Misfit = Misfit()) -> np.ndarray:  # noqa: B008  (immutable)
         """Return the standard error of the normals in degrees, [pixel]."""
-        return standard_error(self.across, self.squares, self.freedom, self.agreeing, misfit)
+        return standard_error(self.across, self.squares, self.freedom, self.spare, self.agreeing, misfit)
 
 
 def cap(count: int, largest_degrees: float) -> np.ndarray:

@@ -15,12 +15,13 @@ class Fit(NamedTuple):
     across: np.ndarray  # [pixel]
     squares: np.ndarray  # [pixel]
     freedom: np.ndarray  # [pixel]
+    spare: np.ndarray  # [pixel]
     agreeing: np.ndarray  # [pixel]
     status: np.ndarray  # [pixel] names
     weights: np.ndarray  # [light, pixel]
 
 
-NOTHING = (np.zeros(3), 0.0, 0.0, 0.0, 0.0, 0.0)
+NOTHING = (np.zeros(3), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def grey_readings(radiance, irradiance, grey_weights, saturated=None):
@@ -74,7 +75,7 @@ def solve_lambert(readings, directions):
             return *NOTHING, status, lit
         squared, count = (lit * (y - directions @ b) ** 2).sum() / (b @ b), lit.sum()
         spare = count - 3 if (y > 0.1 * y.max()).sum() > 3 else 0.0
-        return b / np.linalg.norm(b), np.sqrt(squared / count), across_normal(spread, b), squared, spare, 1.0, status, lit
+        return b / np.linalg.norm(b), np.sqrt(squared / count), across_normal(spread, b), squared, spare, spare, spare, status, lit
 
     return _per_pixel(one, readings)
 
@@ -100,12 +101,14 @@ def solve_robust(readings, directions, *, rounds=5):
                 return *NOTHING, status, np.zeros_like(y)
             off = (y - directions @ b) / (0.05 * np.linalg.norm(b))
             weights = kept / (1 + off**2)
-        off, agreeing = 0.05 * off, (np.abs(0.05 * off[lit]) < 0.15).mean()
+        off, expected = 0.05 * off, directions @ b
+        missing = ~lit & (y > 0) & (expected > 0.35 * np.linalg.norm(b)) & (y < 0.3 * expected)
+        spare, agreeing = lit.sum() + missing.sum() - 3, (1 / (1 + (off[lit] / 0.08) ** 4)).sum() - 3
         slope = max((weights * (2 * weights - 1)).sum() / weights.sum(), 0.25)  # of the influence function, per weight
         squares = (weights * off**2 * weights).sum() / slope**2
         residual = np.sqrt((weights * off**2).sum() / weights.sum())
-        return (b / np.linalg.norm(b), residual, across_normal(spread, b), squares, max(weights.sum() - 3, 0), agreeing, status,
-                weights)
+        return (b / np.linalg.norm(b), residual, across_normal(spread, b), squares, max(weights.sum() - 3, 0), max(spare, 0),
+                max(agreeing, 0), status, weights)
 
     return _per_pixel(one, readings)
 

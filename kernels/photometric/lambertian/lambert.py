@@ -31,7 +31,8 @@ class NormalFit(NamedTuple):
     across: wp.array  # [pixels] float32, radians²: variance of the normal for independent errors of variance |b|² in the readings
     squares: wp.array  # [pixels] float32, sum of the squared errors of the readings that the residuals show, in |b|²
     freedom: wp.array  # [pixels] float32, degrees of freedom of `squares`: the weights of the readings, less the three unknowns
-    agreeing: wp.array  # [pixels] float32, part of the lit readings that b·l predicts; 1 for a solver that rejects none
+    spare: wp.array  # [pixels] float32, number of readings beyond three that are lit, or that b·l says should be
+    agreeing: wp.array  # [pixels] float32, how many of them b·l predicts: all for a solver that rejects none
 
 
 def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
@@ -60,7 +61,7 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
         return zeros(band.pixel_count, wp.float32, band.device)
 
     fit = NormalFit(zeros(band.pixel_count, wp.float32, band.device, rows=3), floats(), zeros(band.pixel_count, wp.int32, band.device),
-                    floats(), floats(), floats(), floats())
+                    floats(), floats(), floats(), floats(), floats())
     lights = wp.array(directions, dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near_lights is not None), band.packs,
                    [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride, *more],
@@ -78,6 +79,7 @@ class NormalArrays:
     across: wp.array(dtype=float)
     squares: wp.array(dtype=float)
     freedom: wp.array(dtype=float)
+    spare: wp.array(dtype=float)
     agreeing: wp.array(dtype=float)
 
 
@@ -89,7 +91,8 @@ def _as_struct(fit: NormalFit) -> Any:
 
 
 @wp.func
-def write_normal(pixel: int, b: wp.vec3, code: int, residual: float, across: float, squares: float, freedom: float, agreeing: float,
+def write_normal(pixel: int, b: wp.vec3, code: int, residual: float, across: float, squares: float, freedom: float,
+                 spare: float, agreeing: float,
                  # outputs
                  fit: NormalArrays):
     """Write one pixel of a NormalFit; only its status where that is not OK."""
@@ -103,6 +106,7 @@ def write_normal(pixel: int, b: wp.vec3, code: int, residual: float, across: flo
         fit.across[pixel] = across
         fit.squares[pixel] = squares
         fit.freedom[pixel] = freedom
+        fit.spare[pixel] = spare
         fit.agreeing[pixel] = agreeing
 
 
@@ -171,7 +175,8 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
             found = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
                               squares[k], int(count[k]))
             # three bright readings and dark ones, which may be shadow, leave nothing to check the fit with
+            spare = wp.where(bright[k] > 3.0, count[k] - 3.0, 0.0)
             write_normal(p * pack + k, found.b, found.status, wp.sqrt(found.residual / wp.max(count[k], 1.0)), found.across,
-                         found.residual, wp.where(bright[k] > 3.0, count[k] - 3.0, 0.0), 1.0, fit)
+                         found.residual, spare, spare, spare, fit)
 
     return lambert_kernel

@@ -19,6 +19,9 @@ from stage.colour.colour import GREY_WEIGHTS
 
 PAIRS = 1024
 """Number of pairs, spread over the object."""
+MANY_CONTRADICTING = 0.2
+"""Part of the readings to spare that contradicts the fits, from which it is said: plaster and real glazed figures have up to 0.12, scenes
+with metal or many shadows more."""
 APART = 2
 """Pixels from the first to the second of a pair, in a row: the noise of neighbours is alike where colours are interpolated."""
 
@@ -30,17 +33,22 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     result = Solution.empty(given.stack.pixel_count)
     own, tilt = result.albedo_own, result.albedo_tilt = np.zeros_like(result.albedo), np.zeros_like(result.albedo)
     misfit = _object_misfit(given, lights, field, fit_normals=fit_normals)
+    if misfit.contradicting:
+        result.facts["contradicting_readings"] = round(misfit.contradicting, 4)
+    if misfit.contradicting > MANY_CONTRADICTING:
+        result.warnings.append(f"{100 * misfit.contradicting:.0f} % of the readings that could check a normal contradict it, as shadows, "
+                               "highlights and metal do: where few check it, sigma is wide; from eight lights on svbrdf is surer")
 
     def solve(read: ReadBand) -> None:
         span, inside, band, readings, near = read
         fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
-        evidence = fit.across, fit.squares, fit.freedom, fit.agreeing
-        across, squared, freedom, agreeing = (to_numpy(array)[: len(inside)] for array in evidence)
+        evidence = fit.across, fit.squares, fit.freedom, fit.spare, fit.agreeing
+        across, squared, freedom, *checks = (to_numpy(array)[: len(inside)] for array in evidence)
         found = fit_albedo(band, readings, fit, lights, near)
         albedo, squares, openness, steep, bounced = (to_numpy(array)[..., : len(inside)] for array in found)
-        result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, agreeing, misfit), bounced, misfit), 0)
+        result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, *checks, misfit), bounced, misfit), 0)
         result.albedo[:, span] = np.where(inside, albedo, 0)
         own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, bounced, freedom, misfit), 0)
         tilt[:, span] = np.where(solved, albedo * np.radians(steep) / np.sqrt(2), 0)  # half of σ² is along the steepest way
@@ -74,7 +82,7 @@ def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = 
         return array[..., : len(pixels)].reshape(*array.shape[:-1], 2, -1)[..., solved]
 
     return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(to_numpy(fit.normal)),
-                                   pairs(to_numpy(fit.squares)), pairs(to_numpy(fit.freedom))))
+                                   *(pairs(to_numpy(values)) for values in (fit.squares, fit.freedom, fit.spare, fit.agreeing))))
 
 
 def pair_starts(mask: np.ndarray, most: int) -> np.ndarray:

@@ -62,7 +62,7 @@ def test_values_are_those_of_the_twin_on_noisy_data(device):
     np.testing.assert_array_equal(solved.weights, readings > 0)
     np.testing.assert_allclose(solved.normal[ok], fit.normal[ok], atol=1e-5)  # float32 normal equations
     np.testing.assert_allclose(solved.residual[ok], fit.residual[ok], atol=1e-4)  # the cancelling difference of squares
-    for name in ("across", "squares", "freedom", "agreeing"):  # float32, and the difference of squares
+    for name in ("across", "squares", "freedom", "spare", "agreeing"):  # float32, and the difference of squares
         np.testing.assert_allclose(getattr(solved, name)[ok], getattr(fit, name)[ok], rtol=1e-3, atol=1e-4, err_msg=name)
     expected = reference.albedo(radiance.astype(float), fit.normal, direction, irradiance, fit.weights)
     np.testing.assert_allclose(solved.albedo, expected, atol=1e-4)

@@ -69,8 +69,8 @@ async function begin(what, name, files, then = "validate") {
         `${bytes(sent)} of ${bytes(total)}${rate(sent - begun.sent, total - begun.sent, (performance.now() - begun.at) / 1000)}`;
       status.textContent = told;
     }, link, then);
-    bar.remove();
     await end(what, found, line, status, link);
+    bar.remove(); // not before the question stands there: a line without either is over, and goes when the panel is closed
   } catch (error) {
     if (!(error instanceof Refusal || error instanceof Stopped || error.name === "AbortError")) throw error;
     over = true;
