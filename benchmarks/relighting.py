@@ -98,8 +98,8 @@ def relighting_table(checks: Path | None) -> list[str]:
     """Return the table as lines of Markdown, and write docs/relighting.png when there are checks.
 
     Args:
-        checks: folder with glossy and owl of samples/make_relight_checks.py, and two_parts, figure, still and desk of samples/make_parts.py, as
-            far as they are there; None: the shipped sample alone.
+        checks: folder with glossy and owl of samples/make_relight_checks.py, and those of samples/make_parts.py, as far as they are
+            there; None: the shipped sample alone.
     """
     lines = ["Relative RMSE over the object, and total energy divided by that of the truth. `--maps`: guided by maps that `svbrdf` "
              "solved from the same capture.", "",

@@ -23,9 +23,9 @@ from stage.capture.point_lights import DistantLights
 
 MAP_SIZE, FIT_SIZE = 120, 64
 """Pixels across the small map on which the outline and shadows are compared, and of the one whose readings are fitted anew."""
-FACING, FACING_INSTEAD = 0.8, 0.95
-"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes. Bare metal, whose
-Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
+FACING, FACING_INSTEAD = 0.8, 0.83
+"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes: 0.85 of objects
+with metal parts. Bare metal, whose Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
 LEAST_LIGHTS = 4
 """Fewer lights may lie almost in a plane, and then most normals of noise face away."""
 CLEAR, CLEAR_PART = 0.4, 0.8
@@ -38,12 +38,14 @@ LIT = 0.7
 """A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl mostly stays below it."""
 MANY_LIGHTS = 6
 """Fewer lights seldom contradict a height: their normals leave no misfit, and shadows turn them."""
-LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 30, 400
-"""Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
-LIT_INVERTED, LIT_WRONG, LIT_SHADOW = 0.85, 0.6, 0.5
+LEAST_SHADOWS, LEAST_SHADOWS_A_LIGHT, LEAST_SHADOWS_ALONE = 30, 4, 400
+"""Least count of readings that the height puts in shadow, and of those under one light, for them to speak against an outline, and alone:
+an inverted object has 5 and more under a light, a white bowl whose walls look flat 3."""
+LIT_INVERTED, LIT_WRONG, MORE_LIT = 0.85, 0.6, 0.05
 """An inverted surface is lit in all the shadows that it should cast (0.89 to 1), but where the right one casts some: then from the second
-part on, and up to the third part of the readings that the inverse puts in shadow is lit. In right hollows at most 0.77 is lit, in white
-ones under three to five lights 0.84, and their inverses cast no shadow, or one that is lit."""
+part on, and by the third part more than where the inverse casts its own (0.05 to 0.7 on objects of several parts, whose heights have false
+steps; right ones as much less). In right hollows at most 0.77 is lit, in white ones under three to five lights 0.84, and their inverses
+cast no shadow, or one that is lit more."""
 LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
 """Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
 INVERSE = np.diag([-1.0, -1.0, 1.0])
@@ -94,7 +96,7 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
         return None
     inward, decided = _is_clear(edge), None
     if lights is not None:
-        decided = _is_inverted(_Shadows(given, solution, small, lights), len(lights.direction) >= MANY_LIGHTS, alone=not inward)
+        decided = _is_inverted(_Shadows(given, solution, small, lights), edge, len(lights.direction))
     if decided:
         return LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that "
                          "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
@@ -104,18 +106,19 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
                      "(turned by 180° about the view axis); nothing else in the images decides")
 
 
-def _is_inverted(shadows: "_Shadows", many: bool, *, alone: bool) -> bool | None:
+def _is_inverted(shadows: "_Shadows", edge: Outline, lights: int) -> bool | None:
     """Return whether cast shadows say that a surface is inverted; None where they do not decide.
 
-    Many lights can contradict the surface by its own shadows; `alone`, no outline speaks for the inversion.
+    Many `lights` can contradict the surface by its own shadows; they do it alone where no outline speaks for the inversion.
     """
+    alone, many = not _is_clear(edge), lights >= MANY_LIGHTS
     count, lit = shadows.of_surface()
-    if count < (LEAST_SHADOWS_ALONE if alone else LEAST_SHADOWS):
+    if count < (LEAST_SHADOWS_ALONE if alone else max(LEAST_SHADOWS, LEAST_SHADOWS_A_LIGHT * min(lights, SHADOW_LIGHTS))):
         return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
     count_inverse, lit_inverse = shadows.of_inverse()
-    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= LIT_SHADOW
+    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= lit - MORE_LIT
     if alone:
-        return many and explained and lit >= LIT_WRONG
+        return many and explained and lit >= LIT_WRONG and edge.outward <= 0
     if many or explained:
         return lit >= (LIT_WRONG if explained else LIT_INVERTED)
     return False if lit < LIT_INVERTED else None

@@ -9,6 +9,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from tests.scenes.captures import angles_degrees, make_scene, manifest_of, ring, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.ellipsoid import ellipsoid, seen_from_near
+from tests.scenes.parts import Part, shoot, sphere_lights, write_shot
 
 SCENE = ellipsoid()
 SURE = 0.3
@@ -121,6 +122,30 @@ def test_an_outline_that_points_inwards_is_said_where_nothing_decides(tmp_path):
     scene = ellipsoid(largest_degrees=12)
     result = solved(tmp_path, scene._replace(directions=scene.directions * [-1, -1, 1]))
     assert "the object is hollow there, or x and y of the lights are" in alarms(result)[0]
+
+
+GOLD = {"albedo": (0.0, 0.0, 0.0), "f0": (0.9, 0.7, 0.35), "roughness": 0.3}
+OF_PARTS = {
+    "a ring before a body": [Part((0.1, 0.1, 0.9), (0.6, 0.6, 0.6), normal=(0.3, 0.2, 0.9327), hole=0.4, **GOLD),
+                             Part((0, 0, -0.1), (1, 0.9, 0.5))],
+    "islands": [Part((-0.5, 0.5, 0.2), (0.35, 0.3, 0.35), **GOLD), Part((0.5, 0.45, 0), (0.3, 0.4, 0.3)),
+                Part((-0.4, -0.5, 0.1), (0.4, 0.25, 0.3), albedo=(0.1, 0.1, 0.1)), Part((0.45, -0.45, 0.3), (0.3, 0.3, 0.3), **GOLD)]}
+"""Objects whose Lambertian normals are poor on metal, and whose heights have false steps between parts."""
+
+
+@pytest.mark.parametrize("parts", OF_PARTS.values(), ids=OF_PARTS)
+@pytest.mark.parametrize(("matrix", "words"), [(np.eye(3), None), (np.diag([-1, -1, 1]), "the surface looks inverted"),
+                                               ([[1, 0, 0], [0, 0, 1], [0, 1, 0]], "with y and z swapped")],
+                         ids=["right", "turned", "exchanged"])
+def test_axes_of_an_object_of_parts_with_metal(tmp_path, parts, matrix, words):
+    shot = shoot(parts, sphere_lights(48, least_z=0.1), side=64, across=2.4, noise=0.01)
+    wrong = shot._replace(scene=shot.scene._replace(directions=shot.scene.directions @ np.array(matrix).T))
+    result = solve(SolveRequest(capture=write_shot(tmp_path / "capture", wrong), out=tmp_path / "out", method=Method.ROBUST, device="cpu"))
+    said = [sentence for sentence in alarms(result) if "direction" in sentence]
+    assert said == [] if words is None else words in said[0]
+    solved = result.maps.mask & shot.scene.mask
+    error = angles_degrees(result.maps.normal[solved], shot.scene.normal[solved])
+    assert (error > 5 * np.maximum(result.maps.sigma[solved], 1)).sum() < 0.02 * shot.scene.mask.sum()
 
 
 def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_path):
