@@ -75,7 +75,7 @@ def solve_lambert(readings, directions):
             return *NOTHING, status, lit
         squared, count = (lit * (y - directions @ b) ** 2).sum() / (b @ b), lit.sum()
         spare = count - 3 if (y > 0.1 * y.max()).sum() > 3 else 0.0
-        return b / np.linalg.norm(b), np.sqrt(squared / count), across_normal(spread, b), squared, spare, spare, spare, status, lit
+        return b / np.linalg.norm(b), np.sqrt(squared / count), across_normal(spread, b), squared, spare, 0.0, 0.0, status, lit
 
     return _per_pixel(one, readings)
 

@@ -31,8 +31,8 @@ class NormalFit(NamedTuple):
     across: wp.array  # [pixels] float32, radians²: variance of the normal for independent errors of variance |b|² in the readings
     squares: wp.array  # [pixels] float32, sum of the squared errors of the readings that the residuals show, in |b|²
     freedom: wp.array  # [pixels] float32, degrees of freedom of `squares`: the weights of the readings, less the three unknowns
-    spare: wp.array  # [pixels] float32, number of readings beyond three that are lit, or that b·l says should be
-    agreeing: wp.array  # [pixels] float32, how many of them b·l predicts: all for a solver that rejects none
+    spare: wp.array  # [pixels] float32, number of readings beyond three that are lit, or that b·l says should be, and could be rejected
+    agreeing: wp.array  # [pixels] float32, how many of them b·l predicts; a solver that rejects none has 0 of both
 
 
 def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
@@ -175,8 +175,7 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
             found = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
                               squares[k], int(count[k]))
             # three bright readings and dark ones, which may be shadow, leave nothing to check the fit with
-            spare = wp.where(bright[k] > 3.0, count[k] - 3.0, 0.0)
             write_normal(p * pack + k, found.b, found.status, wp.sqrt(found.residual / wp.max(count[k], 1.0)), found.across,
-                         found.residual, spare, spare, spare, fit)
+                         found.residual, wp.where(bright[k] > 3.0, count[k] - 3.0, 0.0), 0.0, 0.0, fit)
 
     return lambert_kernel

@@ -98,6 +98,11 @@ def test_no_page_is_ever_dead(browser, own, seed):
         """Return another page than the one that is shown: a browser puts none into its history that is asked for again."""
         return chance.choice([name for name in pages if not visited or name != visited[at]])
 
+    def leave() -> None:
+        """Go to another page, up to where its document is there: modules and data are lost, as nothing could say that a document is."""
+        go(other(), wait="commit")
+        page.locator("main").wait_for(state="attached")
+
     go("light")
     for step in range(STEPS):
         wait_alive(page, visited[at])
@@ -120,12 +125,12 @@ def test_no_page_is_ever_dead(browser, own, seed):
             go(other(), wait="commit")
             go(other())
         elif action == "offline":
-            go(other(), wait="commit")
+            leave()
             context.set_offline(True)
             page.locator("#connection:visible, #stuck:visible").or_(page.locator(CONTENT[visited[at]])).first.wait_for()
             context.set_offline(False)
         elif action == "restart":
-            go(other(), wait="commit")
+            leave()
             restartable.kill()
             page.locator("#connection:visible, #stuck:visible").or_(page.locator(CONTENT[visited[at]])).first.wait_for()
             restartable.start()
