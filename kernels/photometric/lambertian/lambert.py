@@ -23,7 +23,7 @@ PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 class NormalFit(NamedTuple):
     """Normals of a band, and what their uncertainty follows from; the last axis is pixels, padded to whole packs. Only pixels with
-    status OK have values. kernels.photometric.model.misfit makes standard errors and confidence of the last four."""
+    status OK have values. kernels.photometric.model.misfit makes standard errors and confidence of the last five."""
 
     normal: wp.array  # [3, pixels] float32, unit
     residual: wp.array  # [pixels] float32, RMS of (reading - b·l) / |b| over the readings of the fit, by their weights

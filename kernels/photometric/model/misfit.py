@@ -131,9 +131,10 @@ def _share(common: np.ndarray, total: np.ndarray) -> float:
 def standard_error(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray, spare: np.ndarray, agreeing: np.ndarray,
                    misfit: Misfit) -> np.ndarray:
     """Return the standard error of normals in degrees, [pixels] float32, of which the [pixels] of a NormalFit are given."""
-    across, squares, freedom = (np.asarray(values, dtype=np.float64) for values in (across, squares, freedom))
+    across, squares, freedom, spare, agreeing = (np.asarray(values, dtype=np.float64)
+                                                 for values in (across, squares, freedom, spare, agreeing))
     own = across * _variance(squares, freedom, misfit, misfit.excess)
-    wrong = _wrong(*(np.asarray(values, dtype=np.float64) for values in (spare, agreeing)), misfit.contradicting)
+    wrong = _wrong(spare, agreeing, misfit.contradicting)
     sigma = np.degrees(np.sqrt((1 - wrong) * own + wrong * np.maximum(own, WRONG_FIT**2)))
     return np.minimum(sigma, LARGEST_ERROR).astype(np.float32)
 

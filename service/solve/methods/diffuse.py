@@ -17,11 +17,11 @@ from service.solve.base.batches import ReadBand, each_band
 from service.solve.base.solution import Solution, SolveInput
 from stage.colour.colour import GREY_WEIGHTS
 
-PAIRS = 1024
-"""Number of pairs, spread over the object."""
 MANY_CONTRADICTING = 0.2
 """Part of the readings to spare that contradicts the fits, from which it is said: plaster and real glazed figures have up to 0.12, scenes
 with metal or many shadows more."""
+PAIRS = 1024
+"""Number of pairs, spread over the object."""
 APART = 2
 """Pixels from the first to the second of a pair, in a row: the noise of neighbours is alike where colours are interpolated."""
 

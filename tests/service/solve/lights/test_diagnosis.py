@@ -9,7 +9,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from tests.scenes.captures import angles_degrees, make_scene, manifest_of, ring, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.ellipsoid import ellipsoid, seen_from_near
-from tests.scenes.parts import Part, shoot, sphere_lights, write_shot
+from tests.scenes.parts import Part, shoot, sphere_lights
 
 SCENE = ellipsoid()
 SURE = 0.3
@@ -32,9 +32,9 @@ def alarms(result) -> list[str]:
     return [sentence for sentence in result.warnings if sentence.startswith(("frames[]", "color_space"))]
 
 
-def lit_from(matrix):
+def lit_from(matrix, scene=SCENE):
     """The scene with directions that the manifest has multiplied by a matrix."""
-    return SCENE._replace(directions=SCENE.directions @ np.asarray(matrix, dtype=float).T)
+    return scene._replace(directions=scene.directions @ np.asarray(matrix, dtype=float).T)
 
 
 def encoded(linear):
@@ -139,13 +139,12 @@ OF_PARTS = {
                          ids=["right", "turned", "exchanged"])
 def test_axes_of_an_object_of_parts_with_metal(tmp_path, parts, matrix, words):
     shot = shoot(parts, sphere_lights(48, least_z=0.1), side=64, across=2.4, noise=0.01)
-    wrong = shot._replace(scene=shot.scene._replace(directions=shot.scene.directions @ np.array(matrix).T))
-    result = solve(SolveRequest(capture=write_shot(tmp_path / "capture", wrong), out=tmp_path / "out", method=Method.ROBUST, device="cpu"))
+    result = solved(tmp_path, lit_from(matrix, shot.scene), camera=shot.camera)
     said = [sentence for sentence in alarms(result) if "direction" in sentence]
     assert said == [] if words is None else words in said[0]
-    solved = result.maps.mask & shot.scene.mask
-    error = angles_degrees(result.maps.normal[solved], shot.scene.normal[solved])
-    assert (error > 5 * np.maximum(result.maps.sigma[solved], 1)).sum() < 0.02 * shot.scene.mask.sum()
+    mask = result.maps.mask & shot.scene.mask
+    error = angles_degrees(result.maps.normal[mask], shot.scene.normal[mask])
+    assert (error > 5 * np.maximum(result.maps.sigma[mask], 1)).sum() < 0.02 * shot.scene.mask.sum()
 
 
 def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_path):
