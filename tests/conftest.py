@@ -18,9 +18,14 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, lambda *_: None)
 
 
+LONG_PARTS = 6
+"""What .ci/run takes the long tests in, one part for each commit: all of them would take half an hour of two cores."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Let the tests of all devices run as on a machine with a GPU."""
+    """Let the tests of all devices run as on a machine with a GPU, and a part of the long tests alone."""
     parser.addoption("--device-emulated", action="store_true", help="run tests of devices, and no others, on an emulated cuda:0")
+    parser.addoption("--long-part", type=int, metavar="N", help=f"of the long tests run one of {LONG_PARTS} parts, by files")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -81,6 +86,18 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     return Together(config, log)
 
 
+def is_long(item: pytest.Item) -> bool:
+    """Return whether a test is marked `long`."""
+    return item.get_closest_marker("long") is not None
+
+
+def left_out(items: list[pytest.Item], part: int) -> list[pytest.Item]:
+    """Return the long tests of all files but every sixth, beginning with the file of this number modulo six."""
+    files = sorted({item.path for item in items if is_long(item)})
+    chosen = set(files[part % LONG_PARTS::LONG_PARTS])
+    return [item for item in items if is_long(item) and item.path not in chosen]
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the folders of which one process has all, and spread the files that start other programs evenly over the run.
 
@@ -89,10 +106,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     if config.getoption("--device-emulated"):
         items[:] = [item for item in items if "device" in getattr(item, "fixturenames", ())]
+    if config.getoption("--long-part") is not None:
+        without = set(left_out(items, config.getoption("--long-part")))
+        items[:] = [item for item in items if item not in without]
+        config.hook.pytest_deselected(items=list(without))
     groups: dict[str, list[pytest.Item]] = {}
     for item in items:
         groups.setdefault(together(item.nodeid.partition("::")[0]), []).append(item)
-    in_order = sorted(groups, key=lambda group: -sum(item.get_closest_marker("long") is not None for item in groups[group]))
+    in_order = sorted(groups, key=lambda group: -sum(map(is_long, groups[group])))
     folders = [group for group in ONE_SERVER if group in groups]
     starts = [group for group in in_order if group not in folders and set(PROGRAMS) & set(Path(group).parts)]
     others = [group for group in in_order if group not in folders and group not in starts]
