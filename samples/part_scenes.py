@@ -188,6 +188,55 @@ def _coin(p: np.ndarray) -> np.ndarray:
     return 0.6 * (np.maximum(radius - 2.7, np.abs(y) - 0.22 - relief) - 0.08)
 
 
+def _carved(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a carved mask: a shield with a nose, brows, and grooves of sharp edges."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    shield = np.sqrt((x / 6.6) ** 2 + (y / 8.2) ** 2 + ((z + 3) / 4.6) ** 2)
+    base = (shield - 1) * 4.6
+    nose = _capsule(p, (0, 2.6, 1.3), (0, -1.4, 2.6), 0.5, 1.0)
+    brows = np.minimum(*(_capsule(p, (side, 2.9, 1.6), (4.2 * side, 3.6, 0.2), 0.55, 0.35) for side in (-1.0, 1.0)))
+    groove = np.abs(np.hypot(x, 1.3 * (y + 3.6)) - 2.4) - 0.42  # around the mouth
+    lines = np.abs(np.mod(x - 0.25 * y, 1.6) - 0.8) - 0.3 + 2 * np.maximum(4.6 - y, 0)  # on the forehead
+    cut = np.maximum(base, -(np.minimum(groove, lines) + np.abs(base + 0.05)))
+    return 0.6 * np.minimum(_join(cut, nose, 0.5), _join(cut, brows, 0.2))
+
+
+def _painted_mask(p: np.ndarray) -> Paint:
+    x, y, _ = np.moveaxis(p, -1, 0)
+    white, black = np.array([0.82, 0.80, 0.76]), np.array([0.025, 0.025, 0.03])
+    red = np.array([0.55, 0.035, 0.03])
+    sides = smoothstep(-0.04, 0.04, np.abs(x) - 3.0 - 0.6 * np.sin(1.5 * y))
+    eyes = smoothstep(0.05, -0.05, np.hypot(np.abs(x) - 2.2, 1.6 * (y - 1.3)) - 1.1)
+    colour = mix(mix(white, red, sides), black, eyes)
+    varnish = smoothstep(-0.1, 0.1, noise(p, 3.0, seed=61))
+    return Paint(colour, np.full((len(p), 3), 0.6), 0.6 - 0.34 * varnish, np.zeros(len(p)))
+
+
+def _link(p: np.ndarray, centre, axis, long: float) -> np.ndarray:
+    """Return the distance to a link of a chain: a torus stretched along y of its frame."""
+    x, y, z = _in_frame(p, centre, axis)
+    y = y - np.clip(y, -long, long)
+    return np.hypot(np.hypot(x, y) - 0.9, z) - 0.3
+
+
+def _chain(p: np.ndarray) -> np.ndarray:
+    links = [((-5.2, 4.6, 3.0), (0.62, -0.78, 0.0)), ((-3.2, 2.1, 4.4), (0.5, -0.6, 0.62)), ((-1.4, -0.4, 5.6), (0.62, -0.78, 0.1))]
+    return np.minimum.reduce([_link(p, centre, axis, 1.0) for centre, axis in links])
+
+
+def _leaf(p: np.ndarray) -> np.ndarray:
+    x, y, z = _in_frame(p, (4.2, -4.0, 3.4), (0.55, 0.8, 0.25))
+    sheet = np.abs(z - 0.09 * x * x - 0.05 * y * y + 0.2 * np.abs(x)) - 0.12
+    return 0.5 * (np.maximum.reduce([sheet, np.abs(x) - 1.9 * (1 - (y / 4.2) ** 2), np.abs(y) - 4.1]) - 0.05)
+
+
+def _blade(p: np.ndarray) -> np.ndarray:
+    axis = np.array([0.30, 0.52, 0.80]) / np.linalg.norm([0.30, 0.52, 0.80])
+    side = np.cross(axis, [0.8, 0.6, 0])
+    side /= np.linalg.norm(side)
+    return _box((p - [-4.4, -5.4, 4.8]) @ np.stack([side, np.cross(side, axis), axis], axis=1), (0.9, 3.2, 0.08), 0.1)
+
+
 STEEL = _metal([0.63, 0.60, 0.57], 0.36)
 SCENES: dict[str, dict[str, Part]] = {
     "two_parts": {
@@ -214,6 +263,12 @@ SCENES: dict[str, dict[str, Part]] = {
                       _dielectric([0.62, 0.50, 0.30], 0.55)),
         "rubber": Part(lambda p: np.linalg.norm(p - [4.6, -5.6, 5.2], axis=-1) - 2.2, (2.0, -8.2, 2.6), (7.2, -3.0, 7.8),
                        _dielectric([0.03, 0.03, 0.035], 0.35)),
+    },
+    "carved": {
+        "mask": Part(_carved, (-7.4, -9.0, -8.4), (7.4, 9.0, 5.0), _painted_mask),
+        "chain": Part(_chain, (-8.4, -4.2, 1.0), (1.6, 7.8, 7.8), _metal([0.90, 0.72, 0.38], 0.24)),
+        "leaf": Part(_leaf, (-0.4, -9.4, 0.4), (9.2, 1.2, 8.0), _dielectric([0.05, 0.30, 0.04], 0.25)),
+        "blade": Part(_blade, (-8.8, -9.8, 1.0), (0.4, -0.8, 8.8), _metal([0.63, 0.60, 0.57], 0.2)),
     },
 }
 """The parts of each object by name; part.Y of truth.exr counts them from 1."""

@@ -12,7 +12,7 @@ from kernels.status import ESTIMATED
 from service.errors import RequestError
 from service.light_estimation.explanations import grey_readings
 from service.requests.solve import ALBEDO_PERCENTILE, BRIGHT_ALBEDO, SolveRequest
-from service.solve.base.solution import Solution, SolveInput
+from service.solve.base.solution import Solution, SolveInput, half
 from service.solve.lights.intensities import LightsOverTime
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
@@ -70,11 +70,11 @@ def scale_albedo(solution: Solution, request: SolveRequest, brighter: float, ove
     if over_time is not None and request.albedo_scale is None:
         chosen = over_time.share_albedo_scale(chosen)
     factor = np.float32(chosen * brighter)
-    solution.albedo = (solution.albedo * factor).astype(np.float16)
+    solution.albedo = half(solution.albedo * factor)
     for name in ("albedo_own", "albedo_tilt"):
         values = getattr(solution, name)
         if values is not None:
-            setattr(solution, name, (values * factor).astype(np.float16))
+            setattr(solution, name, half(values * factor))
     # no surface reflects more than all light, though single pixels seemed brighter than the others say
     if solution.specular is not None:
         solution.specular = np.minimum(solution.specular * factor, 1).astype(np.float16)

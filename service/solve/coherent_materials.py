@@ -45,6 +45,8 @@ def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, 
     def image(values: np.ndarray) -> np.ndarray:
         return values.reshape(-1, *shape)[:, *box].astype(np.float32)
 
+    if solution.blurred is not None:
+        known.flat[solution.blurred] = False  # their lobes are wider than those of their material
     known = known[box]
     if solution.abundance is not None:
         known &= image(solution.abundance)[0] == 0

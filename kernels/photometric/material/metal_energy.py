@@ -45,7 +45,7 @@ def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarra
         if len(mine) < LEAST_PIXELS:
             continue
         seen = readings[:, mine] >= 0
-        lobe, rise = _lobe(normal[mine], toward[:, mine], view[mine], float(materials[number, 3]))
+        lobe, rise = bare_lobe(normal[mine], toward[:, mine], view[mine], float(materials[number, 3]))
         risen, level = ((seen * part).sum(axis=2, dtype=np.float64) for part in (lobe * rise, lobe * (1 - rise)))
         given = (seen * readings[:, mine]).sum(axis=2, dtype=np.float64) - risen
         f0 = np.minimum(given.sum(axis=1) / np.maximum(level.sum(axis=1), 1e-12), 1)
@@ -57,7 +57,7 @@ def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarra
     return None if (found == materials).all() else found
 
 
-def _lobe(normal: np.ndarray, toward: np.ndarray, view: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
+def bare_lobe(normal: np.ndarray, toward: np.ndarray, view: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
     """Return D V n·l and Schlick's rise, [n, lights] each, of pixels with normals and views [n, 3] and lights [3, n, lights]."""
     alpha2 = roughness**4
     nl, nv = np.einsum("nc,cnl->nl", normal, toward), np.maximum((normal * view).sum(axis=1), 1e-3)[:, None]

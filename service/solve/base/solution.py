@@ -19,6 +19,7 @@ from service.reporting.progress import Timings
 from service.sharing.sharing import SharedSolve
 from stage.capture.camera import Camera
 from stage.colour.colour import GREY_WEIGHTS
+from stage.formats.exr import HALF_MAX
 from stage.stack.stack import Stack
 
 AMBIGUOUS_DEGREES = 5.0
@@ -95,6 +96,7 @@ class Solution:
     abundance: np.ndarray | None = None  # [pixels] float16, share of the first of two materials; 0 where the pixel has one
     pair: np.ndarray | None = None  # [pixels] uint8, which pair these are
     pairs: np.ndarray | None = None  # [pairs, 2, 4] float32, F0 and roughness of both materials; None: no pixel has two
+    blurred: np.ndarray | None = None  # [n] positions of metals that were found by the moments of their readings; None: of none
     specular_normal: np.ndarray | None = None  # [3, pixels] float32
     regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.posterior.sampling.Regime
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet
@@ -119,7 +121,7 @@ class Solution:
         if self.albedo_own is None or self.albedo_tilt is None:
             return None
         sigma = np.hypot(self.albedo_own.astype(np.float32), self.albedo_tilt * self.standard_error())
-        return np.minimum(sigma, np.finfo(np.float16).max).astype(np.float16)
+        return half(sigma)
 
     @property
     def confidence(self) -> np.ndarray:
@@ -138,6 +140,11 @@ class Solution:
         self.normal[:, span] = np.where(inside, to_numpy(fit.normal)[:, :count], 0)
         self.residual[span] = np.where(inside, to_numpy(fit.residual)[:count], 0)
         self.status[span] = np.where(inside, to_numpy(fit.status)[:count], int(Status.UNSOLVED))
+
+
+def half(values: np.ndarray) -> np.ndarray:
+    """Return values as float16, those above its largest as that one: what a lamp in the picture makes of albedo is beyond it."""
+    return np.minimum(values, HALF_MAX).astype(np.float16)
 
 
 def mark_not_facing(camera: Camera, solution: Solution) -> None:

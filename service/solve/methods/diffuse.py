@@ -14,7 +14,7 @@ from kernels.photometric.model.samples import evenly
 from kernels.status import Status
 from service.sharing.sharing import Results
 from service.solve.base.batches import ReadBand, each_band
-from service.solve.base.solution import Solution, SolveInput
+from service.solve.base.solution import Solution, SolveInput, half
 from stage.colour.colour import GREY_WEIGHTS
 
 MANY_CONTRADICTING = 0.2
@@ -49,9 +49,9 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         found = fit_albedo(band, readings, fit, lights, near)
         albedo, squares, openness, steep, bounced = (to_numpy(array)[..., : len(inside)] for array in found)
         result.sigma[span] = np.where(solved, with_bounced(standard_error(across, squared, freedom, *checks, misfit), bounced, misfit), 0)
-        result.albedo[:, span] = np.where(inside, albedo, 0)
-        own[:, span] = np.where(solved, albedo_error(albedo, squares, openness, bounced, freedom, misfit), 0)
-        tilt[:, span] = np.where(solved, albedo * np.radians(steep) / np.sqrt(2), 0)  # half of σ² is along the steepest way
+        result.albedo[:, span] = np.where(inside, half(albedo), 0)
+        own[:, span] = np.where(solved, half(albedo_error(albedo, squares, openness, bounced, freedom, misfit)), 0)
+        tilt[:, span] = np.where(solved, half(albedo * np.radians(steep) / np.sqrt(2)), 0)  # half of σ² is along the steepest way
 
     each_band(given, lights, field, solve,
               Results((result.normal, result.albedo, result.sigma, result.residual, result.status, own, tilt), misfit))

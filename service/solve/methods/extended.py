@@ -20,7 +20,7 @@ from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, View, each_batch, readable, view_directions
-from service.solve.base.solution import Solution, SolveInput
+from service.solve.base.solution import Solution, SolveInput, half
 from service.solve.methods.open_sources import OpenSources, open_sources
 from stage.capture.camera import Camera
 from stage.capture.lighting import ExtendedLights
@@ -169,7 +169,7 @@ class _Walk:
             fit = solve_sampling(samples, self._tables(part.number, samples.device), self._turned_view(part)(pixels), found=turned)
             sigma = np.hypot(fit.sigma, self._doubt[pixels].astype(np.float32))
             result.normal[:, pixels] = (fit.normal @ part.rotation).T
-            result.albedo[:, pixels] = fit.diffuse_albedo.T
+            result.albedo[:, pixels] = half(fit.diffuse_albedo.T)
             result.specular[:, pixels] = fit.specular.T
             result.roughness[pixels] = fit.roughness
             result.regime[pixels] = fit.regime

@@ -28,6 +28,19 @@ def test_thin_images_are_solved(relit, tmp_path, shape, method):
     assert maps.mask.all() and angles_degrees(maps.normal, scene.normal).max() < 0.1  # half rounding of nine readings
 
 
+@pytest.mark.parametrize("method", ["lambert", "robust", "svbrdf"])
+def test_a_lamp_in_the_picture(relit, tmp_path, method):
+    """Its albedo is beyond half floats: the maps are readable, and the others are right to the half rounding of nine readings."""
+    scene = waves(20, 30, 9)
+    scene.images[:, 10, 12] = 60000 * scene.directions[:, 2:]
+    write_capture(tmp_path, scene)
+    relit.done("solve", tmp_path, "--method", method, "--out", tmp_path / "out")
+    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    assert np.isfinite(maps.diffuse_albedo).all() and maps.diffuse_albedo[10, 12].min() > 6e4
+    others = np.abs(np.arange(20) - 10)[:, None] + np.abs(np.arange(30) - 12) > 0
+    assert np.median(angles_degrees(maps.normal, scene.normal)[others]) < 0.1
+
+
 @pytest.mark.parametrize("images", ["alike", "mostly dark"])
 def test_images_that_determine_no_lights(relit, tmp_path, images):
     scene = waves(40, 40, 9)
