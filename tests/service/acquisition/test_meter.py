@@ -87,6 +87,7 @@ def test_clipped_pixels_have_stripes(tmp_path, stage):
     assert red[0] == 0 and red[1] > 1000
 
 
+@pytest.mark.long
 def test_a_camera_that_cannot_be_set_gets_a_factor(tmp_path, stage):
     with controller(tmp_path, stage) as (rig, _):
         found = meter(request(tmp_path, stage, rig), refuse_to_ask)
@@ -99,6 +100,7 @@ def test_a_camera_that_cannot_be_set_gets_a_factor(tmp_path, stage):
         assert not over.sure and over.factor < 1 and over.clipped is None
 
 
+@pytest.mark.long
 def test_the_focus_score_falls_with_blur(tmp_path, stage):
     scores = []
     with controller(tmp_path, stage) as (rig, _):

@@ -111,6 +111,7 @@ def test_a_chart_corrects_the_capture_and_the_report_says_by_how_much(relit, tmp
     assert again["delta_e_2000"]["before"]["mean"] == pytest.approx(kind["delta_e_2000"]["after"]["mean"], abs=0.05)
 
 
+@pytest.mark.long
 def test_integers_in_another_space_and_a_chart_that_stands_on_its_head(relit, tmp_path):
     shown = picture(seen(), POSE)
     folder = shoot(tmp_path / "cap", [noisy(shown.pixels)])

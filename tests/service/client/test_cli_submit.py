@@ -31,6 +31,7 @@ def said(out: str) -> dict[str, str]:
     return {line.partition(" ")[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
 
 
+@pytest.mark.long
 def test_a_folder_becomes_maps(relit, tmp_path: Path):
     found = said(relit("submit", "solve", write_capture(tmp_path / "ball"), "--method", "lambert", "--out", tmp_path / "out").well())
     assert found["state"].startswith("succeeded, ")
@@ -217,6 +218,7 @@ def test_pictures_are_sent_as_they_are_taken_and_the_capture_is_whole_after_the_
     assert other != found.id and client.captures.get(other).state == "ready"
 
 
+@pytest.mark.long
 def test_a_capture_that_was_cut_off_goes_on_with_its_upload(capture, stage, client):
     release = stage.release
 

@@ -120,6 +120,7 @@ def test_a_sun_beyond_the_lamps_is_dilated_as_little_as_can_be(drive, tmp_path):
     assert report["limits"]["dilation_degrees"] <= 1.1 * least + 1
 
 
+@pytest.mark.long
 def test_a_turning_sky_makes_no_lamp_jump(drive, tmp_path):
     """A sun of ten times a lamp's limit over a sky: steps of levels are no larger than 1.2 times those of the shares, limited or not."""
     write_rig(tmp_path / "rig.json", fibonacci_sphere(331), irradiance=0.3, bits=16)

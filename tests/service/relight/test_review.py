@@ -49,6 +49,7 @@ def capture(tmp_path):
     return write_capture(tmp_path / "cap", SCENE)
 
 
+@pytest.mark.long
 def test_the_pictures_of_commands_have_the_view_and_the_look(relit, reviews, capture, tmp_path):
     write_rig(tmp_path / "rig.json", fibonacci_sphere(32))
     write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32))

@@ -125,6 +125,7 @@ def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, views):
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.long
 def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, tmp_path, views):
     folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
     (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "figure", "scans": [

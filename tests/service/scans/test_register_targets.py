@@ -102,6 +102,7 @@ def test_a_flat_wall_is_placed_by_the_marks_that_its_images_show(relit, tmp_path
     assert (tmp_path / "out" / str(found.scans[1].image)).is_file()
 
 
+@pytest.mark.long
 def test_marks_that_no_image_shows_and_boards_without_ends_are_refused(relit, tmp_path):
     folder = write_walls(tmp_path / "set", "aruco4")
     for option, words in ((("--markers", "aruco7"), "--markers aruco7: no scan shows any"), (("--board", "6"), "give two whole numbers"),

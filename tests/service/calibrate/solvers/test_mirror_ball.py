@@ -41,6 +41,7 @@ def test_directions_in_front(name):
         assert spot.spot_degrees == pytest.approx(1.5 * np.sqrt(2), rel=0.45)  # a lobe of 1.5° a side, cut at its foot
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_directions_behind(name):
     """Towards the rim the ball shows more of the world in each pixel: at 115° from the view axis 1 px is 3.5°."""

@@ -125,6 +125,7 @@ def test_a_wrong_declaration_is_named(relit, tmp_path, light, declared, words):
     assert np.percentile(maps.confidence[maps.mask], 99) < 0.2
 
 
+@pytest.mark.long
 def test_most_pixels_refused_is_said(relit, tmp_path, light):
     """A projector of another focal length than declared: columns and rows contradict each other."""
     patterns = (*binary_patterns(WIDTH, "column", references=False), *binary_patterns(RIG.projector[1], "row"))

@@ -44,6 +44,7 @@ def solve(relit, folder, seen, patterns, **world):
     return np.abs(maps.depth - seen.depth)[known] / maps.sigma[known], any(WORDS in text for text in warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("waves"), pytest.param("wave and Gray"), pytest.param("micro", marks=pytest.mark.long)])
 def test_light_below_the_surface_is_in_sigma_and_said(relit, tmp_path, light, name):
     off, said = solve(relit, tmp_path, light, PATTERNS[name], scattered=0.5, scatter_px=4.0, flights=2)

@@ -115,6 +115,7 @@ def test_an_offset_between_rows_is_told(relit, tmp_path):
     assert any(f"{told:+.2f} px" in sentence and "calibrate the cameras again" in sentence for sentence in report["warnings"])
 
 
+@pytest.mark.long
 def test_swapped_images_are_refused_with_a_sentence(relit, tmp_path):
     left, right, _ = seen("plane and sphere")
     pose = reference.look_at((0.12, 0.0, 0.0), (0.12, 0.0, -1.0))  # alike cameras, so that swapping leaves the rows in place

@@ -75,6 +75,7 @@ def test_clear_air_shows_no_fog(change):
     assert find_fog(counts, 0.0, BIN_M) is None
 
 
+@pytest.mark.long
 def test_clipped_counts_are_no_returns(tmp_path):
     """A counter of eight bits: where it is full, the status says so, and the others keep their deviations."""
     counts, distance = histograms(0.0, photons=9000.0)

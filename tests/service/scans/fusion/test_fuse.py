@@ -125,6 +125,7 @@ def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
         FuseRequest(scan_set=file, out=tmp_path / "tiles", close="all", tiles=True)
 
 
+@pytest.mark.long
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     def refused(words, **changes):
         with pytest.raises((RequestError, AssetError), match=words):

@@ -219,6 +219,7 @@ def test_a_body_is_known_by_what_it_looks_like_turned(body, alike):
         assert looks_alike_turned(prepare(scan, cell_m=cell), cell) is alike
 
 
+@pytest.mark.long
 def test_a_body_is_not_joined_to_its_turned_self():
     """From scans 90° apart nothing tells that the arm is missing, and the pose that matches more is a quarter turn off: it is refused, and
     taken with a σ that reaches the true one where that is asked for."""

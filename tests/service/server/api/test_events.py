@@ -62,6 +62,7 @@ def test_a_job_is_followed_to_its_end(server, client, dome, sky):
     assert [event["data"] for event in beyond] == [views[-1]]
 
 
+@pytest.mark.long
 def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
     request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-300"}}
     job = client.post("/v1/jobs", json=request).json()["id"]
@@ -92,6 +93,7 @@ def test_all_jobs_of_a_project_are_watched_at_once(server, client, dome):
             assert time.monotonic() < deadline
 
 
+@pytest.mark.long
 def test_a_stream_that_cannot_be_is_refused(client, solved):
     refused(client.get(f"/v1/jobs/{NOBODY}/events"), 404, NOBODY)
     response = client.get(f"/v1/jobs/{solved}/events", headers={"Last-Event-ID": "now"})

@@ -21,6 +21,7 @@ def test_a_job_that_fails_says_why_and_is_tried_again(server, client, dome):
     assert finish(server, client, job, "failed")["error"] == failed["error"]
 
 
+@pytest.mark.long
 def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, dome):
     job = submit(client, **long)
     has_made(client, job, 2)

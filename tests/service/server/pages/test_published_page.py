@@ -191,6 +191,7 @@ def test_two_fingers_zoom(owl, page):
     page.wait_for_function("Math.abs(Number(location.hash.match(/zoom=([\\d.]+)/)?.[1]) - 2) < .04")
 
 
+@pytest.mark.long
 def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):
     context = new_context(browser)
     page = context.new_page()

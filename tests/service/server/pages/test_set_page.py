@@ -75,6 +75,7 @@ def assert_accessible(page) -> None:
         page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
 
 
+@pytest.mark.long
 def test_only_programs_of_this_machine_reach_the_stage_and_bad_input_is_refused(tmp_path, relit):
     with stage(tmp_path) as (server, _), server.client() as client:
         good = {"name": "one", "plan": "olat"}

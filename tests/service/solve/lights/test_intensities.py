@@ -82,6 +82,7 @@ def test_right_intensities_stay(tmp_path):
     assert np.median(error) < 0.1
 
 
+@pytest.mark.long
 def test_right_intensities_stay_where_the_object_returns_light_to_the_lamp(tmp_path):
     """By Lambert's law a rough object asks for lights that are 5 % stronger from the side, which bent normals by 1.5 degrees."""
     error, report = solved(tmp_path, np.ones(LIGHTS), rough=0.85)

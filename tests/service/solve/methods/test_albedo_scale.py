@@ -158,6 +158,7 @@ def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):
     assert np.median(result.maps.diffuse_albedo) == pytest.approx(ALBEDO, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("declared", ["absolute", "relative"])
 def test_no_bounce_is_taken_out_of_images_without(declared, tmp_path):
     """Images as a renderer of direct light makes them; with the bounce that they lack taken out, the median is 18° off."""
