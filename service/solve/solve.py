@@ -117,14 +117,14 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         solution.warnings.append(opened.distance.warning)
         raise_error(solution, opened.distance.normal_degrees)
     estimated = np.isin(solution.status, ESTIMATED).reshape(shape)
-    sigma = solution.sigma  # as half: an image has tens of millions of pixels
+    sigma, specular = solution.sigma, solution.whole_metals()  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
-        solution.integration = integrate(given, solution.normal, estimated, sigma=sigma, specular=solution.specular)
+        solution.integration = integrate(given, solution.normal, estimated, sigma=sigma, specular=specular)
         solution.height = None if solution.integration is None else to_numpy(solution.integration.height)
     placement = None
     if isinstance(opened.lights, DistantLights):
         placement = place_solution(given, opened.lights, solution, partial(
-            integrate, given, solution.normal, estimated, sigma=sigma, specular=solution.specular))
+            integrate, given, solution.normal, estimated, sigma=sigma, specular=specular))
     if solution.shared_misfit is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)
     if request.materials is Materials.COHERENT:

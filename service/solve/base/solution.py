@@ -123,6 +123,14 @@ class Solution:
         sigma = np.hypot(self.albedo_own.astype(np.float32), self.albedo_tilt * self.standard_error())
         return half(sigma)
 
+    def whole_metals(self) -> np.ndarray | None:
+        """Return F0, [3, pixels], 0 of blurred metals, whose outlines are ragged; None where the method estimates none."""
+        if self.specular is None or self.blurred is None:
+            return self.specular
+        specular = self.specular.copy()
+        specular[:, self.blurred] = 0
+        return specular
+
     @property
     def confidence(self) -> np.ndarray:
         """Return 1 / (1 + standard error / 1°), [pixels] float16; 0 where nothing is estimated."""
