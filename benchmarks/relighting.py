@@ -121,7 +121,8 @@ def relighting_table(checks: Path | None) -> list[str]:
                          (None, check.maps))]
             cells = [f"{rmse:.3f}, {energy:.3f}" for rmse, energy in (error(picture, truth, mask) for picture in pictures)]
             lines.append(f"| {title} | " + " | ".join(cells) + " |")
-            rows.append(_row(f"{check.name}, {environment.removesuffix('.exr')}: path traced", truth, pictures[2], pictures[3], mask))
+            under = environment.removesuffix(".exr").removesuffix("_environment")
+            rows.append(_row(f"{check.name}, {under}: path traced", truth, pictures[2], pictures[3], mask))
         if checks:
             lines += ["", *_near_lines({check.name: check for check, *_ in scenes[1:]})]
             write_sheet(PICTURE, rows, height=220)
