@@ -19,6 +19,8 @@ from tests.scenes.depth import BLACK_WHITE, entry_of
 from tests.service.calibrate.solvers import test_charuco as charuco
 from tests.service.calibrate.solvers import test_procam as boards
 
+pytestmark = pytest.mark.long
+
 CAMERA = boards.CAMERA
 PROJECTOR = reference.Device(256, 192, 360.0, (-0.05, 0.01, 0.0), (-0.0005, 0.001))
 BITS = 8
@@ -66,7 +68,6 @@ def rig(tmp_path_factory):
     return [folder / f"pose{number}" for number in range(5)], points[0]
 
 
-@pytest.mark.long
 def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     folders, points = rig
     outcome = relit.done("calibrate", "procam", *folders, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")
@@ -86,7 +87,6 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     assert np.median(off) < 0.01  # of 0.9 m: five views of corners that are good to 0.1 px
 
 
-@pytest.mark.long
 def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
     """Each pose has another strip of the board cut off by the image or hidden."""
     sheet = charuco.print_of("aruco4", boards.BOARD, side=0.75)
@@ -158,7 +158,6 @@ def test_poses_with_phases_alone_calibrate(relit, rig, tmp_path):
     assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
 
 
-@pytest.mark.long
 def test_poses_at_several_exposures_calibrate(relit, rig, tmp_path):
     """Taken again at a fifth of the time and at three times it, where white clips: joined, the board is seen as at one good exposure."""
     folders, _ = rig
@@ -203,7 +202,6 @@ def test_response_is_written_into_the_projector(relit, tmp_path):
     assert "give numbers from 0 to 1" in relit.refused("calibrate", "response", tmp_path, *names, "--levels", "a,1")
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not REAL.is_dir(), reason="real captures are not part of the project")
 def test_a_real_scan_is_imported_and_decoded(relit, tmp_path):
     """Corners of the real chessboard in the projector lie on one homography of the board: it is flat."""
@@ -261,7 +259,6 @@ def scene(folder, **changes):
     return folder
 
 
-@pytest.mark.long
 def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
     further = scene(tmp_path)
     outcome = relit("depth", further, "--out", tmp_path / "out")
@@ -288,7 +285,6 @@ def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
     assert len(report["other_cameras"][0]["views"]) == 7 and report["other_cameras"][0]["rms_px"] < 0.4
 
 
-@pytest.mark.long
 def test_what_is_wrong_with_several_cameras_is_said(relit, tmp_path):
     board = write_board(tmp_path / "board", 2)
     given = "--board", "9x6", "--square-m", 0.03

@@ -12,6 +12,8 @@ from tests.kernels.scenes import cap
 from tests.reference.groove import Groove
 from tests.scenes.captures import write_exr, write_manifest
 
+pytestmark = pytest.mark.long
+
 
 def shadows(groove: Groove, *, albedo: float, scale: float, stray: float = 0.0, noise: float = 0.0):
     """What fit_albedo_scale takes, under lights that are declared `scale` times too bright, with the true form factors."""
@@ -117,7 +119,6 @@ def by_declaration(tmp_path_factory):
     return found
 
 
-@pytest.mark.long
 def test_the_scale_is_found_and_reported(by_declaration):
     _, _, report = by_declaration["relative"]
     assert report["inputs"]["irradiance_scale"] == "relative"
@@ -148,7 +149,6 @@ def test_maps_have_the_albedo_of_the_surface(by_declaration):
     assert result.maps.albedo_scale == report["found"]["albedo_factor"] == pytest.approx(SCALE, rel=0.12)
 
 
-@pytest.mark.long
 def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):
     _, _, report = by_declaration["absolute"]
     assert "albedo_scale" not in report["found"]
@@ -158,7 +158,6 @@ def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):
     assert np.median(result.maps.diffuse_albedo) == pytest.approx(ALBEDO, rel=0.1)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("declared", ["absolute", "relative"])
 def test_no_bounce_is_taken_out_of_images_without(declared, tmp_path):
     """Images as a renderer of direct light makes them; with the bounce that they lack taken out, the median is 18° off."""

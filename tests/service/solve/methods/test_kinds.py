@@ -11,6 +11,8 @@ from stage.results.maps import SurfaceMaps
 from tests.reference import microfacet
 from tests.scenes.glossy import VIEW, dome, sphere_directions, write_lit
 
+pytestmark = pytest.mark.long
+
 SURFACE = dome(26)
 GLAZED, MATT = slice(0, 26), slice(30, 56)
 MATT_ROUGHNESS, F0 = 0.75, 0.04
