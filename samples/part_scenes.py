@@ -133,12 +133,17 @@ def _box(p: np.ndarray, half: tuple[float, float, float], rounding: float) -> np
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) - rounding
 
 
+def _facing(p: np.ndarray, centre: tuple[float, ...], axis: tuple[float, ...], up: tuple[float, ...]) -> np.ndarray:
+    """Return points in a frame at `centre` whose z is `axis` and whose x stands on `up`."""
+    z = np.array(axis) / np.linalg.norm(axis)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return (p - centre) @ np.stack([x, np.cross(x, z), z], axis=1)
+
+
 def _plate(p: np.ndarray) -> np.ndarray:
     """Return the distance to a plate that leans, left of the vase and before it."""
-    axis = np.array([0.45, 0.25, 0.86]) / np.linalg.norm([0.45, 0.25, 0.86])
-    side = np.cross(axis, [0, 1, 0])
-    side /= np.linalg.norm(side)
-    return _box((p - [-4.6, -3.4, 4.0]) @ np.stack([side, np.cross(side, axis), axis], axis=1), (2.2, 2.6, 0.05), 0.35)
+    return _box(_facing(p, (-4.6, -3.4, 4.0), (0.45, 0.25, 0.86), (0, 1, 0)), (2.2, 2.6, 0.05), 0.35)
 
 
 def _copper_stripes(p: np.ndarray) -> Paint:
@@ -231,10 +236,7 @@ def _leaf(p: np.ndarray) -> np.ndarray:
 
 
 def _blade(p: np.ndarray) -> np.ndarray:
-    axis = np.array([0.30, 0.52, 0.80]) / np.linalg.norm([0.30, 0.52, 0.80])
-    side = np.cross(axis, [0.8, 0.6, 0])
-    side /= np.linalg.norm(side)
-    return _box((p - [-4.4, -5.4, 4.8]) @ np.stack([side, np.cross(side, axis), axis], axis=1), (0.9, 3.2, 0.08), 0.1)
+    return _box(_facing(p, (-4.4, -5.4, 4.8), (0.30, 0.52, 0.80), (0.8, 0.6, 0)), (0.9, 3.2, 0.08), 0.1)
 
 
 STEEL = _metal([0.63, 0.60, 0.57], 0.36)

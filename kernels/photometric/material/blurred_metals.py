@@ -16,7 +16,7 @@ import numpy as np
 
 from kernels.photometric.material.metal_energy import bare_lobe
 from kernels.photometric.model.misfit import LARGEST_ERROR
-from kernels.photometric.model.samples import Samples, host_values, to_host
+from kernels.photometric.model.samples import Samples, host_vectors, to_host
 
 LEAST_LIGHTS = 32
 """Fewest lights whose half vectors have a mean: among sixteen a highlight falls on one or none."""
@@ -25,8 +25,6 @@ POWER, REACH_DEGREES, ROUNDS = 1.5, 25.0, 8
 rounds."""
 ROUGHNESS = np.linspace(0.1, 0.9, 17)
 """Roughness that is tried."""
-LESS_MISREAD = 0.75
-"""Part to which a metal must lower the share of the light that is misread, or all light."""
 DEGREES_PER_MISREAD = 30.0
 """Standard error of the normal in degrees where all light is misread: on eleven captures of five path-traced objects under 32 to 128 lights
 error/σ is 0.45 in the median and 2.2 at the 95th percentile."""
@@ -48,8 +46,8 @@ class BlurredMetals(NamedTuple):
 def find_blurred_metals(samples: Samples) -> BlurredMetals:
     """Return the metal that the moments of the readings of sampled pixels make; waits for the device.
     `samples`: of LEAST_LIGHTS lights or more of one direction each."""
-    colour = np.stack([np.maximum(host_values(samples, samples.colour[c]), 0) for c in range(3)]).astype(np.float64)  # 0: no reading
-    toward = np.stack([host_values(samples, samples.toward[c]) for c in range(3)]).astype(np.float64)
+    colour = np.maximum(host_vectors(samples, samples.colour), 0).astype(np.float64)  # 0: no reading
+    toward = host_vectors(samples, samples.toward).astype(np.float64)
     view, grey = to_host(samples, samples.view).astype(np.float64), colour.mean(axis=0)
     half = np.moveaxis(toward, 0, 2) + view[:, None]
     half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-6)

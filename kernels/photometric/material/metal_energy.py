@@ -12,7 +12,7 @@ Source: the energy of a lobe is that of its mean over normals (Olano and Baker, 
 import numpy as np
 
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, Material, fit_given
-from kernels.photometric.model.samples import Samples, host_values, to_host
+from kernels.photometric.model.samples import Samples, host_vectors, to_host
 from kernels.photometric.search.hypotheses import Diffuse
 
 LEAST_PIXELS = 16
@@ -38,7 +38,7 @@ def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarra
         return None
     costs = np.stack([fit_given(samples, normal, material, shape=shape).cost for material in materials])
     nearest, bare = costs.argmin(axis=0), single.specular.max(axis=1) > BRIGHTEST_DIELECTRIC
-    readings, toward = (np.stack([host_values(samples, plane[c]) for c in range(3)]) for plane in (samples.colour, samples.toward))
+    readings, toward = (host_vectors(samples, planes) for planes in (samples.colour, samples.toward))
     view, found = to_host(samples, samples.view), materials.copy()
     for number in metal:
         mine = np.flatnonzero((nearest == number) & bare)

@@ -190,6 +190,11 @@ def host_values(samples: Samples, packs: wp.array) -> np.ndarray:
     return flat.reshape(-1, samples.light_count)[: samples.pixel_count]
 
 
+def host_vectors(samples: Samples, planes: wp.array) -> np.ndarray:
+    """Return [3, packs · lights] packs on the device, colours or directions, as [3, n, lights] host values; waits for the device."""
+    return np.stack([host_values(samples, planes[c]) for c in range(3)])
+
+
 def device_values(samples: Samples, values: np.ndarray) -> wp.array:
     """Return [n, lights] host values as [packs · lights] packs on the device."""
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy import ndimage
 
 from kernels.device import to_numpy
 from kernels.photometric.lambertian.lambert import solve_lambert
@@ -17,9 +16,9 @@ from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.material.albedo_error import albedo_error
-from kernels.photometric.material.blurred_metals import LEAST_LIGHTS, LESS_MISREAD, find_blurred_metals
+from kernels.photometric.material.blurred_metals import LEAST_LIGHTS
 from kernels.photometric.material.lost_light import misread_light
-from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, MATT, fit_given, fit_tinted
+from kernels.photometric.material.material import MATT, fit_given, fit_tinted
 from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.misfit import LARGEST_ERROR
@@ -39,6 +38,7 @@ from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, p
 from service.solve.base.solution import Solution, SolveInput, half
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.part_scene import Material
+from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.settling import as_shown, middles_of, settle
@@ -49,13 +49,6 @@ SHARED_PAIRS = 384
 """Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
-AT_ONCE = 4096
-"""Pixels that are read at one time where only some of the image are."""
-EIGHT = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
-"""The neighbours of a pixel."""
-LEAST_METALS = 3
-"""Neighbours, of eight, that are metals or lose light too, beside which a pixel that loses light may be one: single pixels that do lie in
-grooves."""
 PRIOR_STRENGTH = 10.0
 """Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
 for a reading that misfits by the noise floor of the search."""
@@ -284,31 +277,11 @@ class _Walk:
             (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt, misread),
             (None if light is None else light.found, kinds.which, kinds.kinds, self._supported, shared)))
         result.shared_misfit, result.albedo_own, result.albedo_tilt = shared, own, tilt
-        result.blurred = blurred = self._blurred_metals(misread, light)
+        blurred = place_blurred_metals(result, misread, self._given.mask.shape, partial(self._read, light=light))
         abundance[blurred], own[:, blurred], tilt[:, blurred] = 0, 0, 0
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, kinds.pairs
             result.facts["mixed_pixels"] = int(mixed.sum())
-
-    def _blurred_metals(self, misread: np.ndarray, light: DirectLight | None) -> np.ndarray:
-        """Replace what was found of pixels by blurred metals that explain more of their light; return the positions of these pixels.
-        `misread`: [pixels] share of the light that is misread, 0 of pixels whose material accounts for it."""
-        result, changed = self.result, [np.zeros(0, int)]
-        bright = (misread > 0) | (self._specular.max(axis=0) > BRIGHTEST_DIELECTRIC)
-        around = ndimage.convolve(bright.reshape(self._given.mask.shape).astype(np.uint8), EIGHT, mode="constant").reshape(-1)
-        tried = np.flatnonzero((misread > 0) & (around >= LEAST_METALS))
-        for start in range(0, len(tried), AT_ONCE):
-            pixels = tried[start:start + AT_ONCE]
-            metal = find_blurred_metals(self._read(pixels, light))
-            less = metal.misread < LESS_MISREAD * np.minimum(misread[pixels], 1)
-            pixels = pixels[less]
-            result.normal[:, pixels], result.albedo[:, pixels], self._specular[:, pixels] = metal.normal[less].T, 0, metal.specular[less].T
-            self._roughness[pixels], result.sigma[pixels] = metal.roughness[less], metal.sigma[less]
-            changed.append(pixels)
-        found = np.concatenate(changed)
-        if len(found):
-            result.facts["blurred_metals"] = len(found)
-        return found
 
     def _shared_misfit(self, light: DirectLight | None) -> float:
         """Return the share of the misfit that neighbouring pixels have in common."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.model.samples import Samples, device_values, host_values
+from kernels.photometric.model.samples import Samples, device_values, host_values, host_vectors
 from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
@@ -42,7 +42,7 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     `samples`: some hundreds of pixels, spread over the object, under four lights or more. `start`: [n, 3] unit normals to begin from."""
     lights = samples.light_count
     readings = host_values(samples, samples.grey).astype(np.float64)
-    toward = np.stack([host_values(samples, samples.toward[axis]) for axis in range(3)], axis=-1).astype(np.float64)
+    toward = np.moveaxis(host_vectors(samples, samples.toward), 0, -1).astype(np.float64, order="C")
     parts = min(PARTS, lights)
     costs: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for part in range(parts):

@@ -9,6 +9,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.results.maps import SurfaceMaps
 from tests.reference import microfacet
+from tests.scenes.captures import angles_degrees
 from tests.scenes.glossy import VIEW, dome, reflect, sphere_directions, write_lit
 
 SIZE, FINER = 40, 8
@@ -46,7 +47,7 @@ def test_hammered_gold_is_no_dark_dielectric(tmp_path):
     facts = json.loads((tmp_path / "maps" / "report.json").read_text())["found"]
     bare = maps.specular.max(axis=-1) > 0.2
     mean = pixels(fine)
-    off = np.degrees(np.arccos(np.clip((maps.normal * mean / np.linalg.norm(mean, axis=-1, keepdims=True)).sum(axis=-1), -1, 1)))[BAND]
+    off = angles_degrees(maps.normal[BAND], (mean / np.linalg.norm(mean, axis=-1, keepdims=True))[BAND])
     assert bare[BAND].mean() > 0.8 and not bare[SURFACE.mask & ~BAND].any()
     assert facts["blurred_metals"] > 0.6 * BAND.sum()
     assert np.median(off) < 4 and np.percentile(off / maps.sigma[BAND], 95) < 2.5
