@@ -19,7 +19,7 @@ from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.status import Status
 from service.sharing.sharing import Results
 from service.solve.base.batches import each_span, view_directions
-from service.solve.base.solution import Solution, SolveInput
+from service.solve.base.solution import Solution, SolveInput, half
 from stage.capture.camera import Camera
 from stage.capture.gradients import GradientFrames
 from stage.colour.colour import GREY_WEIGHTS
@@ -133,7 +133,8 @@ def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.n
 def _store(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
     """Store the result of a band; 0 outside the mask, which as a status is UNSOLVED."""
     assert target is not None
-    target[..., here] = np.where(kept, to_numpy(found)[..., : len(kept)], 0)
+    values = to_numpy(found)[..., : len(kept)]
+    target[..., here] = np.where(kept, half(values) if target.dtype == np.float16 else values, 0)
 
 
 def _moments(band: Band, rows: np.ndarray, stack: Stack) -> Moments:

@@ -126,6 +126,15 @@ def test_a_grey_object_is_taken_as_diffuse_and_the_report_says_so(relit, tmp_pat
     assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.08
 
 
+def test_a_lamp_in_the_picture_is_bright_and_leaves_maps_that_can_be_read(relit, tmp_path, diffuse):
+    inside = tuple(np.argwhere(SCENE.mask)[0])
+    lit = diffuse.copy()
+    lit[(slice(None), *inside)] *= 1e5
+    write(tmp_path, {"cross": lit / 2})
+    maps, _ = solve(relit, tmp_path)
+    assert maps.diffuse_albedo[inside].max() == np.finfo(np.float16).max
+
+
 def test_a_perspective_camera(relit, tmp_path, diffuse):
     camera = {"projection": "perspective", "resolution": [SIZE, SIZE], "focal_px": [40, 40], "principal_px": [6, 6]}
     write(tmp_path, {"cross": diffuse / 2}, camera=camera)
