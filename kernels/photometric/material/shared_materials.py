@@ -12,7 +12,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 
 import numpy as np
 
-from kernels.photometric.material.material import MATT, fit_given, fit_material, is_dielectric
+from kernels.photometric.material.material import MATT, Material, fit_given, fit_material, is_dielectric
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.hypotheses import Diffuse
 
@@ -53,6 +53,15 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
         materials.append(index)
         best = np.minimum(best, costs[index])
     return _with_one_f0(samples, normal, candidates[materials].astype(np.float32), costs[materials], shape=shape)
+
+
+def best_dielectric(samples: Samples, normal: np.ndarray, shared: np.ndarray | None, *, shape: Diffuse) -> Material:
+    """Return the dielectric among the shared materials, [materials, 4], that explains each sampled pixel best, or a matt one if none is
+    among them; waits for the device."""
+    known = np.zeros((0, 4)) if shared is None else shared[is_dielectric(shared)]
+    fits = [fit_given(samples, normal, lobe, shape=shape) for lobe in (known if len(known) else MATT[None])]
+    best = np.argmin([fit.cost for fit in fits], axis=0)
+    return Material(*(np.stack(planes)[best, np.arange(len(best))] for planes in zip(*fits, strict=True)))
 
 
 def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:

@@ -17,7 +17,7 @@ from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_r
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.material.albedo_error import albedo_error
 from kernels.photometric.material.blurred_metals import LEAST_LIGHTS
-from kernels.photometric.material.lost_light import misread_light
+from kernels.photometric.material.lost_light import account_light
 from kernels.photometric.material.material import MATT, fit_given, fit_tinted
 from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.model.chosen_samples import choose
@@ -43,6 +43,7 @@ from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.settling import as_shown, middles_of, settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
+from service.solve.methods.unseen_metals import replace_unseen_metals
 from stage.colour.colour import GREY_WEIGHTS
 
 SHARED_PAIRS = 384
@@ -246,6 +247,7 @@ class _Walk:
         abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
         own, tilt = np.zeros_like(result.albedo), np.zeros_like(result.albedo)
         misread = np.zeros(count, np.float16)  # share of the light, of pixels whose material loses most of it
+        shown = np.ones(count, np.float16)  # share of the predicted light
         shared = self._shared_misfit(light)
         light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
 
@@ -270,15 +272,19 @@ class _Walk:
             abundance[pixels], pair[pixels] = found.mixture
             pair[pixels[found.mixture.abundance > 0]] += np.uint8(first_pair)
             sigma[pixels], result.residual[pixels] = found.sigma, found.residual
-            if self._seeks_blurred_metals:
-                misread[pixels] = misread_light(samples, found.normal, found)
+            if self._seeks_metals:
+                misread[pixels], shown[pixels] = account_light(samples, found.normal, found)
 
         self._batches("normals", fit, Results(
-            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt, misread),
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt, misread,
+             shown),
             (None if light is None else light.found, kinds.which, kinds.kinds, self._supported, shared)))
         result.shared_misfit, result.albedo_own, result.albedo_tilt = shared, own, tilt
-        blurred = place_blurred_metals(result, misread, self._given.mask.shape, partial(self._read, light=light))
-        abundance[blurred], own[:, blurred], tilt[:, blurred] = 0, 0, 0
+        read, shape = partial(self._read, light=light), self._given.mask.shape
+        abundance[replace_unseen_metals(result, shown, shape, kinds, read)] = 0
+        if self._given.stack.light_count >= LEAST_LIGHTS:
+            blurred = place_blurred_metals(result, misread, shape, read)
+            abundance[blurred], own[:, blurred], tilt[:, blurred] = 0, 0, 0
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, kinds.pairs
             result.facts["mixed_pixels"] = int(mixed.sum())
@@ -296,8 +302,8 @@ class _Walk:
         return shared
 
     @property
-    def _seeks_blurred_metals(self) -> bool:
-        return self._options.metals and self._supported and not self._matt and self._given.stack.light_count >= LEAST_LIGHTS
+    def _seeks_metals(self) -> bool:
+        return self._options.metals and self._supported and not self._matt
 
     @property
     def _few(self) -> bool:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kernels.photometric.material.blurred_metals import find_blurred_metals
-from kernels.photometric.material.lost_light import misread_light
+from kernels.photometric.material.lost_light import account_light
 from kernels.photometric.material.material import Material
 from tests.kernels.photometric.material.test_metal_energy import blurred
 from tests.kernels.photometric.material.test_mixtures import GOLD, metal
@@ -29,11 +29,12 @@ def test_the_light_that_a_material_loses(device, count):
     lights = sphere_directions(count)
     gold, _ = sample(metal(NORMAL, ROUGHNESS**2, lights), device, lights=lights)
     dark = of_one_material([0.05, 0.04, 0.02], [0.04] * 3, 0.4)
-    assert (misread_light(gold, NORMAL, dark) > 0.5).mean() > 0.9
-    assert not misread_light(gold, NORMAL, of_one_material([0] * 3, GOLD, ROUGHNESS)).any()
+    assert (account_light(gold, NORMAL, dark).misread > 0.5).mean() > 0.9
+    assert not account_light(gold, NORMAL, of_one_material([0] * 3, GOLD, ROUGHNESS)).misread.any()
     paint, _ = sample(render(NORMAL, alpha=0.3**2, f0=0.08, lights=lights), device, lights=lights)
-    assert not misread_light(paint, NORMAL, of_one_material(COLOUR, [0.08] * 3, 0.3)).any()
-    assert (misread_light(paint, NORMAL, of_one_material(COLOUR, [0.0] * 3, 1.0)) > 0).mean() < 0.15  # highlights of a dielectric, all lost
+    assert not account_light(paint, NORMAL, of_one_material(COLOUR, [0.08] * 3, 0.3)).misread.any()
+    matt = of_one_material(COLOUR, [0.0] * 3, 1.0)  # loses the highlights of a dielectric
+    assert (account_light(paint, NORMAL, matt).misread > 0).mean() < 0.15
 
 
 @pytest.mark.parametrize(("count", "turn"), [(128, 16.0), (128, 30.0), (64, 30.0)])
