@@ -268,7 +268,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
     parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
     parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py, and "
-                                                           "two_parts, figure, still, desk and carved of samples/make_parts.py")
+                                                           "two_parts, figure, still, desk, carved and atelier of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where about 40 GB may be written and are removed again")
     parser.add_argument("--before", type=Path, help="checkout of an older version, to compare the speed with")

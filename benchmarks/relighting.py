@@ -22,7 +22,7 @@ from stage.results.maps import MAPS_FILE, SurfaceMaps
 PICTURE = Path(__file__).parents[1] / "docs" / "relighting.png"
 GAIN = 4.0
 """The factor by which differences are shown brighter."""
-OBJECTS = ("glossy", "owl", "two_parts", "figure", "still", "desk", "carved")
+OBJECTS = ("glossy", "owl", "two_parts", "figure", "still", "desk", "carved", "atelier")
 
 
 class Check(NamedTuple):

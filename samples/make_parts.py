@@ -4,8 +4,9 @@
     python samples/make_parts.py figure --out parts/figure --noise 0.01
 
 `two_parts`: a metal ball before a lumpy painted body that has a stripe of metal with soft borders. `figure`: a ring and an arm before a
-torso with deep folds. 128 distant lights over the whole sphere, then the same object under the lights of make_relight_checks.py, with the
-same names. Not committed. It traces with Mitsuba's scalar variant, so that it needs no LLVM, within a few minutes on 2 cores.
+torso with deep folds. `atelier`: a velvet cushion, a lacquered apple and a brushed disc, whose sheen, coat and anisotropy no map holds.
+128 distant lights over the whole sphere, then the same object under the lights of make_relight_checks.py, with the same names. Not
+committed. It traces with Mitsuba's scalar variant, so that it needs no LLVM, within a few minutes on 2 cores.
 A run that was interrupted is completed by running it again.
 """
 
@@ -36,7 +37,7 @@ def part_mesh(mi, name: str, mesh: part_scenes.PartMesh):
 
     def principled(colour: str, metallic: float) -> dict:
         return {"type": "principled", "base_color": {"type": "mesh_attribute", "name": colour}, "metallic": metallic,
-                "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"}, "specular": SPECULAR}
+                "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"}, "specular": SPECULAR, **mesh.beyond}
 
     props = mi.Properties()
     props["bsdf"] = mi.load_dict({"type": "blendbsdf", "weight": {"type": "mesh_attribute", "name": "vertex_share"},

@@ -5,7 +5,8 @@ Everything here is in metres, in the camera frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ class Part(NamedTuple):
     lower: tuple[float, float, float]  # cm, of a box around it
     upper: tuple[float, float, float]
     paint: Callable[[np.ndarray], Paint]  # of points in centimetres
+    beyond: Mapping[str, float] = MappingProxyType({})  # further parameters of Mitsuba's `principled`: what no map of Relit's holds
 
 
 class PartMesh(NamedTuple):
@@ -42,6 +44,7 @@ class PartMesh(NamedTuple):
     faces: np.ndarray  # [F, 3]
     normals: np.ndarray  # [V, 3]
     paint: Paint
+    beyond: Mapping[str, float]  # as of the part
 
 
 def build(part: Part, *, detail: float) -> PartMesh:
@@ -50,7 +53,7 @@ def build(part: Part, *, detail: float) -> PartMesh:
     for _ in range(2):
         points, faces = subdivide(project(part.distance, points, step=0.01), faces)
     points = project(part.distance, points, step=0.01, rounds=2)
-    return PartMesh(points * CM, faces, gradient(part.distance, points, step=0.005), part.paint(points))
+    return PartMesh(points * CM, faces, gradient(part.distance, points, step=0.005), part.paint(points), part.beyond)
 
 
 def _capsule(p: np.ndarray, start, end, thick: float, thin: float) -> np.ndarray:
@@ -239,6 +242,42 @@ def _blade(p: np.ndarray) -> np.ndarray:
     return _box(_facing(p, (-4.4, -5.4, 4.8), (0.30, 0.52, 0.80), (0.8, 0.6, 0)), (0.9, 3.2, 0.08), 0.1)
 
 
+def _cushion(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a cushion with three deep buttons and folds around the lowest."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    across = ((np.abs(x) / 8.2) ** 4 + (np.abs(y) / 7.4) ** 4) ** 0.25
+    body = (np.sqrt(across**2.6 + ((z + 2) / 4.2) ** 2) - 1) * 3.2
+    for middle in ((-2.6, 1.6), (2.6, 1.6), (0, -2.6)):
+        r = np.hypot(x - middle[0], y - middle[1])
+        body = body + np.exp(-((r / 0.75) ** 2)) + 0.35 * np.exp(-((r / 2.0) ** 2))
+    folds = 0.12 * np.sin(5 * np.arctan2(y + 2.6, x)) * np.exp(-(((np.hypot(x, y + 2.6) - 2.2) / 1.2) ** 2))
+    return 0.6 * (body + folds)
+
+
+def _velvet(p: np.ndarray) -> Paint:
+    x, y, _ = np.moveaxis(p, -1, 0)
+    stripes = smoothstep(-0.1, 0.1, np.sin(1.1 * (x + y)))
+    colour = mix(np.array([0.22, 0.03, 0.05]), np.array([0.05, 0.06, 0.20]), stripes)
+    return Paint(colour, np.full((len(p), 3), 0.6), np.full(len(p), 0.8), np.zeros(len(p)))
+
+
+def _apple(p: np.ndarray) -> np.ndarray:
+    x, y, z = _in_frame(p, (3.4, -3.4, 4.6), (0.25, 0.9, 0.4))
+    return 0.7 * (np.hypot(np.hypot(x, z) - 1.0, y) - 1.55 + 0.075 * y)
+
+
+def _apple_paint(p: np.ndarray) -> Paint:
+    spots = smoothstep(-0.6, 0.6, noise(p, 1.2, seed=7) + 0.6 * np.sin(1.3 * p[:, 0]))
+    colour = mix(np.array([0.45, 0.02, 0.02]), np.array([0.55, 0.40, 0.05]), spots)
+    return Paint(colour, np.full((len(p), 3), 0.6), np.full(len(p), 0.55), np.zeros(len(p)))
+
+
+def _disc(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a slightly hollow disc."""
+    x, y, z = _in_frame(p, (-3.4, 3.8, 4.8), (0.35, -0.3, 0.88))
+    return 0.8 * np.maximum(np.hypot(x, y) - 2.9, np.abs(z - 0.03 * (x * x + y * y)) - 0.25) - 0.05
+
+
 STEEL = _metal([0.63, 0.60, 0.57], 0.36)
 SCENES: dict[str, dict[str, Part]] = {
     "two_parts": {
@@ -271,6 +310,11 @@ SCENES: dict[str, dict[str, Part]] = {
         "chain": Part(_chain, (-8.4, -4.2, 1.0), (1.6, 7.8, 7.8), _metal([0.90, 0.72, 0.38], 0.24)),
         "leaf": Part(_leaf, (-0.4, -9.4, 0.4), (9.2, 1.2, 8.0), _dielectric([0.05, 0.30, 0.04], 0.25)),
         "blade": Part(_blade, (-8.8, -9.8, 1.0), (0.4, -0.8, 8.8), _metal([0.63, 0.60, 0.57], 0.2)),
+    },
+    "atelier": {
+        "cushion": Part(_cushion, (-9.4, -8.8, -7.4), (9.4, 8.8, 4.0), _velvet, {"sheen": 1.0, "sheen_tint": 0.5}),
+        "apple": Part(_apple, (-0.4, -7.4, 0.6), (7.2, 0.8, 8.8), _apple_paint, {"clearcoat": 1.0, "clearcoat_gloss": 0.95}),
+        "disc": Part(_disc, (-7.4, -0.2, 1.6), (0.6, 7.8, 8.2), _metal([0.72, 0.70, 0.66], 0.32), {"anisotropic": 0.8}),
     },
 }
 """The parts of each object by name; part.Y of truth.exr counts them from 1."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels.device import to_numpy
 from kernels.photometric.lambertian.readings import Lights
 from kernels.photometric.model.samples import evenly, readings_of
 from kernels.photometric.shadows.shadow_evidence import shadow_odds
@@ -34,6 +35,15 @@ BLUR_PIXELS = 0.7
 LEAST_SIGMA_PIXELS = 0.7
 """Least σ of an offset, in pixels of the thinned picture: rays are followed pixel by pixel, and shapes err along outlines, which all lights
 see alike. Errors of path-traced balls and rings are up to 0.8 pixels."""
+
+IN_SHADOW = 1.5
+"""Log odds of shadow from which on a reading is in shadow without doubt."""
+LEAST_DARK = 0.001
+"""Least part of the compared readings that must be in shadow without doubt before the surface is held against them."""
+BESIDE = ((0, 0), (0, 2), (0, -2), (2, 0), (-2, 0))
+"""Rows and columns, in pixels of the thinned picture, to which a shadow that the surface throws may lie aside of the one in the images."""
+NO_PART = -2
+"""The number of no part: against it none moves."""
 
 
 class Material(NamedTuple):
@@ -111,6 +121,30 @@ class PartScene:
         shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, box, self._projection)
         evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self.size, blur=self._blur)
         return choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
+
+    def unexplained(self, height: np.ndarray, part: np.ndarray, sure: np.ndarray) -> float:
+        """Return the share of the readings in shadow that a surface throws no shadow on, its parts as walls; 0 where hardly any reading
+        is in shadow.
+
+        Args:
+            height: [rows, cols].
+            part: [rows, cols] int, -1 outside of the mask.
+            sure: [rows, cols] bool, where a normal is known well enough to tell shadow.
+        """
+        thinned, thin_part = (np.ascontiguousarray(values[self._thin]) for values in (height.astype(np.float32), part.astype(np.int32)))
+        dark = (self._odds > IN_SHADOW) & sure[self._thin][tuple(self._read.T)][:, None]
+        if dark.mean() < LEAST_DARK:
+            return 0.0
+        device = self._device
+        surface, parts = wp.array(thinned, dtype=float, device=device), wp.array(thin_part, dtype=wp.int32, device=device)
+        backs = wp.zeros(thinned.shape, dtype=float, device=device)  # of walls nothing passes behind
+        thrown = np.zeros(dark.shape, bool)
+        for aside in BESIDE:
+            pixels = np.clip(self._read + aside, 0, np.array(thinned.shape) - 1).astype(np.int32)
+            shadows = march_part(wp.array(pixels, dtype=wp.vec2i, device=device), self._toward, surface, parts, backs, NO_PART,
+                                 extent_of(thinned, thin_part >= 0).box, self._projection)
+            thrown |= to_numpy(shadows.hidden) > 0
+        return float((dark & ~thrown).sum() / dark.sum())
 
     def is_known(self, low: float, high: float) -> bool:
         """Return whether offsets between these bounds place a part."""

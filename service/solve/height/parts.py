@@ -14,7 +14,7 @@ import numpy as np
 from kernels.photometric.lambertian.readings import Lights, pad_lights
 from kernels.surface.integrate import Integration
 from kernels.surface.offsets import Offset
-from service.solve.base.solution import Solution, SolveInput
+from service.solve.base.solution import AMBIGUOUS_DEGREES, Solution, SolveInput
 from service.solve.height.part_scene import LEAST_SHARE, MOST_PARTS, Material, PartScene
 from service.solve.height.torn import Again, tear
 from stage.capture.point_lights import DistantLights
@@ -25,6 +25,8 @@ SETTLED = 0.25
 """Change of an offset, in its σ, below which the sweeps end."""
 NOWHERE = Offset(0.0, math.inf, 0.0, 0.0, 0.0, 0.0)
 """The offset of a part that has not been moved."""
+MANY_UNEXPLAINED = 0.1
+"""Share of the shadows in the images, thrown by nothing, from which on it is warned of."""
 LARGE_SHARE = 0.05
 """Part of the surface from which a part of unknown step is warned of."""
 
@@ -69,6 +71,8 @@ class Placement(NamedTuple):
     height: np.ndarray  # [rows, cols] float32, its mean that of mean_height
     parts: list[PlacedPart]
     """Largest first; none where the surface has no break."""
+    unexplained: float = 0.0
+    """Share of the shadows in the images that the surface does not throw."""
 
     def warnings(self) -> list[str]:
         """Return a sentence where a large part may lie anywhere in depth."""
@@ -83,13 +87,23 @@ class Placement(NamedTuple):
                        "object's size" if contradicted else "no shadow falls across the break")
                 found.append(f"height: the step to {len(some)} large part{'s' * (len(some) > 1)} of the object is unknown (around the "
                              f"pixel {where}, row and column): normals do not tell it, and {why}; capture lights from the side")
+        if self.unexplained > MANY_UNEXPLAINED:
+            found.append(f"height: {self.unexplained:.0%} of the shadows in the images fall where this height throws none: something "
+                         "stands farther before what it shades than here, as beaks, sticks and wires whose distance no normal tells, or "
+                         "outside the mask")
         return found
 
 
 def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, surface: Integration,
-                height: np.ndarray, again: Again) -> tuple[Integration, Placement]:
+                height: np.ndarray, again: Again, sure: np.ndarray | None = None) -> tuple[Integration, Placement]:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images; return the surface too, of which
-    shadows may have parted what normals joined. `normal`: [3, pixels] float32. `height`: [rows, cols] float32, that of the surface."""
+    shadows may have parted what normals joined.
+
+    Args:
+        normal: [3, pixels] float32.
+        height: [rows, cols] float32, that of the surface.
+        sure: [rows, cols] bool, where the shadows in the images are compared with those of the result; None: nowhere.
+    """
     assert surface.fragment is not None
     scene_of = cache(partial(PartScene, given, lights, normal, material, surface.fragment >= 0))  # its readings are looked at once
     surface, height = tear(surface, height, scene_of, again)
@@ -100,7 +114,7 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     moved = order[1 : 1 + MOST_PARTS]
     moved = moved[size[moved] >= LEAST_SHARE * size.sum()]
     if not len(moved):
-        return surface, Placement(height, [])
+        return surface, Placement(height, [], 0.0 if sure is None else scene_of().unexplained(height, part, sure))
     scene = scene_of()
     scene.show(height, part)
     found: dict[int, Offset] = {}
@@ -129,7 +143,8 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
         offset = scene.in_heights(number, found[number]) if number in found else None
         doubt = None if offset is not None else contradiction.get(number)
         placed.append(PlacedPart(int(size[number]), (row, col), offset, number == int(order[0]), doubt))
-    return surface, Placement(scene.whole_height(), placed)
+    whole = scene.whole_height()
+    return surface, Placement(whole, placed, 0.0 if sure is None else scene.unexplained(whole, part, sure))
 
 
 def place_solution(given: SolveInput, lights: DistantLights, solution: Solution, again: Again) -> Placement | None:
@@ -140,7 +155,8 @@ def place_solution(given: SolveInput, lights: DistantLights, solution: Solution,
     padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
     material = Material(solution.albedo, solution.specular, solution.roughness)
     solution.integration, placement = place_parts(given, padded, solution.normal, material, solution.integration, solution.height,
-                                                  again)
+                                                  again, solution.standard_error().reshape(given.mask.shape) < AMBIGUOUS_DEGREES)
+    solution.facts["unexplained_shadows"] = round(placement.unexplained, 3)
     solution.height = placement.height
     solution.warnings += placement.warnings()
     return placement

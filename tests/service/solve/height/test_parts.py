@@ -88,6 +88,18 @@ def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_pat
     assert [part["status"] for part in report["parts"]] == ["reference", "known"]
     assert abs(step_error(maps, shot)) < 0.03 and abs(step_error(maps, shot)) * 2.0 < 3 * report["parts"][1]["sigma"]
     assert 0.9 < report["parts"][1]["pixels"] / (shot.part == 0).sum() < 1.1
+    assert report["found"]["unexplained_shadows"] < 0.02
+
+
+@pytest.mark.parametrize("gap", [0.75, pytest.param(1.1, marks=pytest.mark.long)])
+def test_a_wire_that_loses_its_step_is_named_by_its_shadows(gap, tmp_path):
+    """Two pixels thick: no part, so that the height leaves it near the body. Its shadows fall where that height throws none."""
+    wire = Part((0.05, 0.1, gap), (0.5, 0.035, 0.035))
+    shot = shoot([wire, ball_before_body()[1]], sphere_lights(48), side=SIDE, across=2.2, noise=0.02)
+    maps, report = solved(shot, tmp_path)
+    share = report["found"]["unexplained_shadows"]
+    assert abs(step_error(maps, shot)) > 0.05 and share > 0.1
+    assert any(f"{share:.0%} of the shadows" in sentence for sentence in report["warnings"])
 
 
 @pytest.mark.long
