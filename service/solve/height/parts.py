@@ -6,6 +6,7 @@ shadows leave open stays where the normals put it.
 """
 
 import math
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -114,7 +115,7 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     moved = order[1 : 1 + MOST_PARTS]
     moved = moved[size[moved] >= LEAST_SHARE * size.sum()]
     if not len(moved):
-        return surface, Placement(height, [], 0.0 if sure is None else scene_of().unexplained(height, part, sure))
+        return surface, Placement(height, [], _unexplained(scene_of, height, part, sure))
     scene = scene_of()
     scene.show(height, part)
     found: dict[int, Offset] = {}
@@ -144,7 +145,14 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
         doubt = None if offset is not None else contradiction.get(number)
         placed.append(PlacedPart(int(size[number]), (row, col), offset, number == int(order[0]), doubt))
     whole = scene.whole_height()
-    return surface, Placement(whole, placed, 0.0 if sure is None else scene.unexplained(whole, part, sure))
+    return surface, Placement(whole, placed, _unexplained(scene_of, whole, part, sure))
+
+
+def _unexplained(scene_of: Callable[[], PartScene], height: np.ndarray, part: np.ndarray, sure: np.ndarray | None) -> float:
+    """Return the share of the shadows at pixels that are sure which the surface does not throw; 0 where there is no such pixel."""
+    if sure is None or not (sure & (part >= 0)).any():
+        return 0.0
+    return scene_of().unexplained(height, part, sure)
 
 
 def place_solution(given: SolveInput, lights: DistantLights, solution: Solution, again: Again) -> Placement | None:

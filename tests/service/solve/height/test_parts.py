@@ -58,6 +58,19 @@ def test_a_tilted_disc_over_a_plane_has_both_slopes(tmp_path):
     assert abs(step_error(maps, shot)) < 0.02 and report["parts"][1]["status"] == "known"
 
 
+def test_a_surface_of_which_nothing_is_solved_throws_no_shadow(tmp_path):
+    """Lights declared behind the object: no normal faces the camera."""
+    shot = shoot(disc_over_plane(), sphere_lights(24, least_z=0.3), side=SIDE, across=2.4)
+    write_shot(tmp_path / "capture", shot)
+    manifest = json.loads((tmp_path / "capture" / "capture.json").read_text())
+    for frame in manifest["frames"]:
+        frame["light"]["direction"][2] *= -1
+    (tmp_path / "capture" / "capture.json").write_text(json.dumps(manifest))
+    solve(SolveRequest(capture=tmp_path / "capture", out=tmp_path / "out", method=Method.ROBUST, device="cpu"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["pixels"]["ok"] == 0 and "of the shadows" not in " ".join(report["warnings"])
+
+
 def test_a_part_whose_shadow_meets_no_other_has_an_unknown_step(tmp_path):
     """A second ball beside the body, so far off that no shadow joins them."""
     parts = [Part((1.7, 0.0, 0.4), (0.4, 0.4, 0.4)), Part((0.0, 0.0, 0.0), (0.7, 0.7, 0.5))]
