@@ -89,9 +89,9 @@ class Placement(NamedTuple):
                 found.append(f"height: the step to {len(some)} large part{'s' * (len(some) > 1)} of the object is unknown (around the "
                              f"pixel {where}, row and column): normals do not tell it, and {why}; capture lights from the side")
         if self.unexplained > MANY_UNEXPLAINED:
-            found.append(f"height: {self.unexplained:.0%} of the shadows in the images fall where this height throws none: something "
-                         "stands farther before what it shades than here, as beaks, sticks and wires whose distance no normal tells, or "
-                         "outside the mask")
+            found.append(f"height: {self.unexplained:.0%} of the shadows in the images fall where this height throws none: it is too flat, "
+                         "as normals under bounced light make it, or something stands farther before what it shades, as sticks and wires "
+                         "whose distance no normal tells, or outside the mask")
         return found
 
 
