@@ -138,13 +138,16 @@ class PartScene:
         device = self._device
         surface, parts = wp.array(thinned, dtype=float, device=device), wp.array(thin_part, dtype=wp.int32, device=device)
         backs = wp.zeros(thinned.shape, dtype=float, device=device)  # of walls nothing passes behind
-        thrown = np.zeros(dark.shape, bool)
+        left, box = dark.copy(), extent_of(thinned, thin_part >= 0).box
         for aside in BESIDE:
-            pixels = np.clip(self._read + aside, 0, np.array(thinned.shape) - 1).astype(np.int32)
-            shadows = march_part(wp.array(pixels, dtype=wp.vec2i, device=device), self._toward, surface, parts, backs, NO_PART,
-                                 extent_of(thinned, thin_part >= 0).box, self._projection)
-            thrown |= to_numpy(shadows.hidden) > 0
-        return float((dark & ~thrown).sum() / dark.sum())
+            rows = np.flatnonzero(left.any(axis=1))
+            if not len(rows):
+                break
+            pixels = np.clip(self._read[rows] + aside, 0, np.array(thinned.shape) - 1).astype(np.int32)
+            shadows = march_part(wp.array(pixels, dtype=wp.vec2i, device=device), self._toward, surface, parts, backs, NO_PART, box,
+                                 self._projection)
+            left[rows] &= to_numpy(shadows.hidden) == 0
+        return float(left.sum() / dark.sum())
 
     def is_known(self, low: float, high: float) -> bool:
         """Return whether offsets between these bounds place a part."""
