@@ -35,6 +35,8 @@ def replace_unseen_metals(solution: Solution, shown: np.ndarray, shape: tuple[in
     assert solution.specular is not None and solution.roughness is not None
     assert solution.albedo_own is not None and solution.albedo_tilt is not None
     metal = (solution.specular.max(axis=0) > BRIGHTEST_DIELECTRIC).reshape(shape)
+    if not metal.any():
+        return np.zeros(0, int)
     total, count = (ndimage.uniform_filter(values, WINDOW, np.float32, mode="constant")
                     for values in (metal * shown.reshape(shape).astype(np.float32), metal))
     unseen = np.flatnonzero(metal & (total < LEAST_SHOWN * count))
