@@ -6,10 +6,8 @@ from scipy import ndimage
 from kernels.photometric.material.blurred_metals import find_blurred_metals
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC
 from service.solve.base.solution import Solution
-from service.solve.methods.kinds import Read
+from service.solve.methods.kinds import READ_AT_ONCE, Read
 
-AT_ONCE = 4096
-"""Pixels that are read at one time."""
 EIGHT = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 """The neighbours of a pixel."""
 LEAST_METALS = 3
@@ -33,8 +31,8 @@ def place_blurred_metals(solution: Solution, misread: np.ndarray, shape: tuple[i
     around = ndimage.convolve(bright.reshape(shape).astype(np.uint8), EIGHT, mode="constant").reshape(-1)
     tried = np.flatnonzero((misread > 0) & (around >= LEAST_METALS))
     changed = [np.zeros(0, int)]
-    for start in range(0, len(tried), AT_ONCE):
-        pixels = tried[start:start + AT_ONCE]
+    for start in range(0, len(tried), READ_AT_ONCE):
+        pixels = tried[start:start + READ_AT_ONCE]
         metal = find_blurred_metals(read(pixels))
         less = metal.misread < LESS_MISREAD * np.minimum(misread[pixels], 1)
         pixels = pixels[less]

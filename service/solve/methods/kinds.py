@@ -38,6 +38,8 @@ OWN = 0.9
 
 Read = Callable[[np.ndarray], Samples]
 """A function from positions of pixels to their direct light."""
+READ_AT_ONCE = 4096
+"""Pixels whose direct light is read at one time."""
 
 
 class Kind(NamedTuple):

@@ -11,10 +11,8 @@ from kernels.photometric.material.albedo_error import albedo_error
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC
 from kernels.photometric.material.shared_materials import best_dielectric
 from service.solve.base.solution import Solution, half
-from service.solve.methods.kinds import Kinds, Read
+from service.solve.methods.kinds import READ_AT_ONCE, Kinds, Read
 
-AT_ONCE = 4096
-"""Pixels that are read at one time."""
 WINDOW = 5
 """Side in pixels of the window over whose metals the light that they show is averaged."""
 LEAST_SHOWN = 0.35
@@ -40,8 +38,8 @@ def replace_unseen_metals(solution: Solution, shown: np.ndarray, shape: tuple[in
     total, count = (ndimage.uniform_filter(values, WINDOW, np.float32, mode="constant")
                     for values in (metal * shown.reshape(shape).astype(np.float32), metal))
     unseen = np.flatnonzero(metal & (total < LEAST_SHOWN * count))
-    for start in range(0, len(unseen), AT_ONCE):
-        for at, kind, _ in kinds.groups(here := unseen[start:start + AT_ONCE]):
+    for start in range(0, len(unseen), READ_AT_ONCE):
+        for at, kind, _ in kinds.groups(here := unseen[start:start + READ_AT_ONCE]):
             pixels = here[at]
             samples, normal = read(pixels), solution.normal[:, pixels].T
             found = best_dielectric(samples, normal, kind.materials, shape=kind.lobe)
