@@ -132,7 +132,7 @@ def relighting_table(checks: Path | None) -> list[str]:
 def _near_lines(checks: dict[str, Check]) -> list[str]:
     lines = ["Near and area lights: `relit shade` with solved maps, compared with the path tracer with all bounces. In the last column "
              "true maps are compared; its `median` is that of the relative difference from direct light alone, over pixels brighter than a "
-             "twentieth of the mean.", "",
+             "twentieth of the mean. Maps hold one normal a pixel, and no sheen, coat or anisotropy (`atelier`).", "",
              "| | maps alone | with `--capture` | true maps, direct light: RMSE, median |", "|---|---|---|---|"]
     for name, check in checks.items():
         truth_maps, mask = true_maps(check), check.mask
