@@ -135,19 +135,19 @@ class PartScene:
         dark = (self._odds > IN_SHADOW) & sure[self._thin][tuple(self._read.T)][:, None]
         if dark.mean() < LEAST_DARK:
             return 0.0
+        count = dark.sum()
         device = self._device
         surface, parts = wp.array(thinned, dtype=float, device=device), wp.array(thin_part, dtype=wp.int32, device=device)
         backs = wp.zeros(thinned.shape, dtype=float, device=device)  # of walls nothing passes behind
-        left, box = dark.copy(), extent_of(thinned, thin_part >= 0).box
+        box = extent_of(thinned, thin_part >= 0).box
         for aside in BESIDE:
-            rows = np.flatnonzero(left.any(axis=1))
-            if not len(rows):
+            if not len(rows := np.flatnonzero(dark.any(axis=1))):  # those without a shadow on them so far
                 break
             pixels = np.clip(self._read[rows] + aside, 0, np.array(thinned.shape) - 1).astype(np.int32)
             shadows = march_part(wp.array(pixels, dtype=wp.vec2i, device=device), self._toward, surface, parts, backs, NO_PART, box,
                                  self._projection)
-            left[rows] &= to_numpy(shadows.hidden) == 0
-        return float(left.sum() / dark.sum())
+            dark[rows] &= to_numpy(shadows.hidden) == 0
+        return float(dark.sum() / count)
 
     def is_known(self, low: float, high: float) -> bool:
         """Return whether offsets between these bounds place a part."""

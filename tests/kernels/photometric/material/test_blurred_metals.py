@@ -12,12 +12,12 @@ from tests.kernels.photometric.material.test_mixtures import GOLD, metal
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
 from tests.scenes.glossy import sphere_directions
 
-NORMAL, ROUGHNESS = tilted(200, 60.0), 0.28
+COUNT = 200
+NORMAL, ROUGHNESS = tilted(COUNT, 60.0), 0.28
 
 
-def of_one_material(albedo, f0, roughness):
+def of_one_material(albedo, f0, roughness, *, count=COUNT):
     """The same material at every pixel."""
-    count = len(NORMAL)
     return Material(np.tile(np.float32(albedo), (count, 1)), np.tile(np.float32(f0), (count, 1)), np.full(count, roughness, np.float32),
                     np.zeros(count, np.float32))
 

@@ -3,12 +3,12 @@
 import numpy as np
 
 from kernels.photometric.material.lost_light import account_light
-from kernels.photometric.material.material import Material
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.search.hypotheses import Diffuse
 from service.solve.base.solution import Solution
 from service.solve.methods.kinds import Kind, Kinds
 from service.solve.methods.unseen_metals import replace_unseen_metals
+from tests.kernels.photometric.material.test_blurred_metals import of_one_material
 from tests.kernels.photometric.material.test_mixtures import GOLD, metal
 from tests.kernels.photometric.test_svbrdf import render, sample
 from tests.scenes.glossy import sphere_directions
@@ -36,10 +36,8 @@ def test_a_hollow_is_no_metal_though_its_shadows_hide_the_highlights_of_one(devi
     solution.normal = normal.T.copy()
     solution.specular, solution.roughness = np.tile(np.float16(GOLD)[:, None], count), np.full(count, ROUGHNESS, np.float16)
     solution.albedo_own, solution.albedo_tilt = np.zeros_like(solution.albedo), np.zeros_like(solution.albedo)
-    found = Material(np.zeros((count, 3), np.float32), np.tile(np.float32(GOLD), (count, 1)), np.full(count, ROUGHNESS, np.float32),
-                     np.zeros(count, np.float32))
-    shown = account_light(samples, normal, found).shown
-    assert shown[hollow].max() < 0.2 and shown[columns == 8].max() < 0.35  # half of the gold's own lobe, 50 degrees away, is less
+    shown = account_light(samples, normal, of_one_material([0] * 3, GOLD, ROUGHNESS, count=count)).shown
+    assert shown[hollow].max() < 0.2 and shown[columns == 8].max() < 0.35  # gold shines where its true normal says
     assert shown[~turned].min() > 0.99  # half floats of the stack
     kinds = Kinds(Kind(Diffuse(), Diffuse(), SHARED), count)
     changed = replace_unseen_metals(solution, shown, (SIDE, SIDE), kinds, lambda pixels: choose(samples, pixels))
