@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
 EMULATED := OPENBLAS_NUM_THREADS=1 nice $(BIN)/python -m pytest -q -n 2 --device-emulated -m "not long" tests/kernels tests/test_device_ways.py \
-  tests/test_gpu_benchmark.py
+  tests/test_gpu_benchmark.py tests/service/sharing
 
 .PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed

@@ -10,6 +10,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import TypeVar
 
 from dbos import DBOS
@@ -55,6 +56,8 @@ class JobRunner:
         self._signs: dict[Claim, float] = {}  # last sign of progress of each running step; two attempts of a job may overlap
         self._running: set[str] = set()
         self._pieces: dict[Claim, JobPieces] = {}
+        self._device = threading.Lock()
+        """Held by what works on the device: a step that was cancelled works until its next sign, while the queue gives the next job."""
 
     @property
     def running(self) -> frozenset[str]:
@@ -111,7 +114,7 @@ class JobRunner:
         log.info("help begins")
         progress = HelpProgress(self._context, job, alive=lambda: self._sign(claim), ending=self._draining.is_set)
         try:
-            with places_named():
+            with places_named(), self._device:
                 help_with(job, self._context, progress)
             log.info("help done")
         except Stopped:
@@ -207,8 +210,9 @@ class JobRunner:
             size = None
             if not isinstance(job.request, CheckJob):
                 progress.guard = self._context.require_space
-            progress.begin(name.partition(" ")[0])
-            with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named():
+            with (telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named(),
+                  nullcontext() if isinstance(job.request, CheckJob) else self._device):  # checks need no device
+                progress.begin(name.partition(" ")[0])
                 step.run(progress)
             if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files
                 raise Stopped

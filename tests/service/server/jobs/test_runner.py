@@ -1,5 +1,9 @@
 """How a worker does a job when the database does not answer, or something goes wrong that nobody thought of."""
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 from sqlalchemy.exc import OperationalError
 
@@ -146,6 +150,35 @@ def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, ru
     do_nothing(monkeypatch, run)
     assert made.run(claim) in (STOPPED, jobs.FAILED)
     assert not folder.exists()
+
+
+def test_a_cancelled_step_ends_before_the_next_job_works_on_the_device(idle_harness, runner, monkeypatch):
+    """The queue gives a worker the next job as soon as one is cancelled; two that capture graphs on one GPU would end the process."""
+    made, first = runner
+    second = Claim(idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5), 1, "one")
+    idle_harness.take(second.job, "one")
+    begun, cancelled, order = threading.Event(), threading.Event(), []
+
+    def run(progress):
+        if not begun.is_set():
+            begun.set()
+            assert cancelled.wait(30)
+            time.sleep(0.2)  # in which the other would begin
+            order.append("first ends")
+        else:
+            order.append("second works")
+
+    do_nothing(monkeypatch, run)
+    with ThreadPoolExecutor(2) as pool:
+        stopped = pool.submit(made.run, first)
+        assert begun.wait(30)
+        idle_harness.database.transact(lambda connection: jobs.cancel(connection, first.job))
+        done = pool.submit(made.run, second)
+        while idle_harness.row(second.job)["state"] != jobs.RUNNING:
+            time.sleep(0.01)
+        cancelled.set()
+        assert (stopped.result(30), done.result(30)) == (STOPPED, DONE)
+    assert order == ["first ends", "second works", "second works"]
 
 
 def test_a_step_that_would_fill_the_disk_fails_with_a_sentence(runner, idle_harness, monkeypatch):
