@@ -7,10 +7,12 @@ while a body scatters farther the light that it absorbs less (Jensen, Marschner,
 Light Transport", SIGGRAPH 2001, table 1), so that its brighter colour has the softer edges. Bounced light lifts the brighter colour in
 shadows, but leaves their edges as sharp as they are; sensors with a mosaic of colours resolve red and blue alike.
 
-A body that scatters all colours alike, or much farther than its shadows are wide, is not told from an opaque one that is flatter.
+A body that scatters all colours alike, or much farther than its shadows are wide, is not told from an opaque one that is flatter; nor are
+bodies in JPEG files.
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -29,12 +31,18 @@ LEAST_COSINE = 0.25
 """Least cosine between normal and light of readings that are compared: below, a small error of the normal makes a large one of them."""
 MOST_RATIO = 1.25
 """A reading more above the median of its pixel is a highlight."""
+LEAST_BRIGHT = 0.1
+"""Least part that a pixel reflects of what the brightest of its square does, in each colour: of darker ones noise is most."""
 LEAST_EDGES = 50
+LEAST_STEP = 0.5
+"""Least difference over three spans in green: below, the edge may be noise."""
 LEAST_CONTRAST = {"darker": 0.4, "brighter": 0.1}
 """Least difference over three spans in the darker and the brighter of red and blue: below, the shadow is narrower than they are."""
 LEAST_SHARPER = 1.12
-"""Least ratio of sharpness in the darker colour to that in the brighter: 0.9 to 1.04 in opaque scenes, with bounced light too, and real
-captures; 1.2 to 1.3 where light scatters twice as far in red as in blue."""
+"""Least ratio of sharpness in the darker colour to that in the brighter: 0.96 to 1.04 in opaque scenes, with bounced light and noise too;
+1.2 to 1.3 where light scatters twice as far in red as in blue."""
+JPEG = ".jpg", ".jpeg"
+"""Images whose colours are stored coarser than their brightness, so that edges in the darker colour are up to 1.3 times as sharp."""
 BLUR = 0.8
 """Standard deviation of the blur that is undone, in widths of an edge."""
 
@@ -58,24 +66,27 @@ class Translucency(NamedTuple):
 
 def find_translucency(given: SolveInput, lights: DistantLights, solution: Solution) -> Translucency | None:
     """Return what shadows say of the way of light below the surface, or None where they show none."""
-    if not (lights.irradiance > 0).all():
+    if not (lights.irradiance > 0).all() or any(Path(name).suffix.lower() in JPEG for name in given.stack.frames):
         return None
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     squares = list(_ratios(given, lights, solution.normal, estimated))
     red, _, blue = np.sum([albedo for albedo, _ in squares], axis=0) if squares else np.zeros(3)
     darker = 0 if red < blue else 2
-    sharper, width = 0.0, 0.0
+    sharper, least, width = 0.0, 0.0, 0.0
     for span in SPANS:
         edges = np.concatenate([_edges(ratio, span) for _, ratio in squares]) if squares else np.zeros((0, 4, 3))
         if len(edges) < LEAST_EDGES:
             continue
-        inner, outer = np.median(edges[:, 2] - edges[:, 1], axis=0), np.median(edges[:, 3] - edges[:, 0], axis=0)
-        if inner.min() <= 0 or outer[darker] < LEAST_CONTRAST["darker"] or outer[2 - darker] < LEAST_CONTRAST["brighter"]:
+        inner, outer = edges[:, 2] - edges[:, 1], edges[:, 3] - edges[:, 0]
+        passed, whole = inner.mean(axis=0), outer.mean(axis=0)
+        if passed.min() <= 0 or whole[darker] < LEAST_CONTRAST["darker"] or whole[2 - darker] < LEAST_CONTRAST["brighter"]:
             continue
-        sharp = inner / outer
-        sharper = max(sharper, float(sharp[darker] / sharp[2 - darker]))
-        width = width or span / float(inner.mean())  # by the narrowest span that tells
-    if sharper < LEAST_SHARPER:
+        sharp = passed / whole
+        error = (inner - sharp * outer).std(axis=0) / passed / np.sqrt(len(edges))  # relative, of a ratio of means
+        found = float(sharp[darker] / sharp[2 - darker])
+        sharper, least = max(sharper, found), max(least, found * (1 - 2 * float(np.hypot(error[0], error[2]))))
+        width = width or span / float(passed.mean())  # by the narrowest span that tells
+    if least < LEAST_SHARPER:
         return None
     return Translucency(sharper, width, _lost(solution.normal, estimated, BLUR * width))
 
@@ -97,23 +108,26 @@ def _ratios(given: SolveInput, lights: DistantLights, normal: np.ndarray,
         albedo = np.where(known[..., None], radiance[chosen] / expected, np.inf).astype(np.float32)
         median = np.take_along_axis(np.sort(albedo, axis=0), (known.sum(axis=0) // 2)[None, :, None], axis=0)[0]  # lit, where most are
         told = np.isfinite(median) & (median > 0)
+        told &= median > LEAST_BRIGHT * np.max(median, axis=0, where=told, initial=0)
         ratio = np.where(known[..., None] & told, albedo, np.nan) / np.where(told, median, 1)
         yield np.where(told, median, 0).mean(axis=0), ratio.reshape(-1, *place.shape, 3)
 
 
 def _edges(ratio: np.ndarray, span: int) -> np.ndarray:
     """Return the readings at four pixels on a line across an edge of a shadow, from dark to lit, between the inner of which half of the
-    light is passed: [edges, 4, 3]."""
-    grey, found = ratio.mean(axis=-1), [np.zeros((0, 4, 3), np.float32)]
+    light is passed: [edges, 4, 3]. Green alone finds them: what its noise chooses is no edge of red or of blue."""
+    found = [np.zeros((0, 4, 3), np.float32)]
     for axis in (1, 2):
-        colours, along = np.moveaxis(ratio, axis, 0), np.moveaxis(grey, axis, 0)
+        colours, along = np.moveaxis(ratio, axis, 0), np.moveaxis(ratio[..., 1], axis, 0)
         count = len(along) - 3 * span
         if count <= 0:
             continue
         first, second = along[span:][:count], along[2 * span :][:count]
         for places, step in ((np.nonzero((first < 0.5) & (second >= 0.5)), 1), (np.nonzero((first >= 0.5) & (second < 0.5)), -1)):
             line = np.stack([colours[places[0] + number * span, *places[1:]] for number in range(4)][::step], axis=1)
-            found.append(line[np.isfinite(line).all(axis=(1, 2)) & (line < MOST_RATIO).all(axis=(1, 2))])
+            green = line[..., 1]
+            told = np.isfinite(line).all(axis=(1, 2)) & (green < MOST_RATIO).all(axis=1) & (green[:, 3] - green[:, 0] > LEAST_STEP)
+            found.append(line[told])
     return np.concatenate(found)
 
 

@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from tests.scenes.captures import Scene, write_capture
 
-ALBEDO = np.array([0.6, 0.5, 0.4])
 REACH = 4.5
 """Lengths after which nothing is scattered."""
 
@@ -22,6 +21,7 @@ REACH = 4.5
 class Body(NamedTuple):
     """What a body does with light."""
 
+    albedo: tuple[float, float, float] = (0.6, 0.5, 0.4)
     lengths: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of scattering in each colour, pixels; 0: opaque."""
     lens_px: float = 0.0
@@ -86,8 +86,9 @@ def write(folder: Path, body: Body, *, side: int = 64, lights: int = 24, noise: 
         for channel, matrix in enumerate(spread):
             back = falls if matrix is None else (matrix @ falls.reshape(-1)).reshape(falls.shape)
             back = back + body.bounced[channel] * gaussian_filter(falls, 12)
-            image[..., channel] = ALBEDO[channel] * (gaussian_filter(back, body.lens_px) if body.lens_px else back)
+            image[..., channel] = body.albedo[channel] * (gaussian_filter(back, body.lens_px) if body.lens_px else back)
     images = np.maximum(images + noise * rng.standard_normal(images.shape), 0)
     full = np.ones((side, side), dtype=bool)
-    write_capture(folder, Scene(normal, np.broadcast_to(ALBEDO, (side, side, 3)), full, directions, np.full((lights, 3), np.pi), images))
+    albedo = np.broadcast_to(body.albedo, (side, side, 3))
+    write_capture(folder, Scene(normal, albedo, full, directions, np.full((lights, 3), np.pi), images))
     return normal
