@@ -13,6 +13,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.images import ImagesOnDevice
+from service.light_estimation.dark_lights import dark_frames, dark_sentence
 from service.relight.attributes import time_attributes
 from service.relight.clipping import Clipping
 from service.relight.combine import chunk_frames, linear_frames, row_blocks
@@ -140,7 +141,11 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     with timings.part("ingest"):
         stack = merge_brackets(opened.ingest.stack(None if plan.is_sequence else lambda done, _: timings.advance(done)),
                                opened.capture.sources(), opened.lights)
-        clipping = Clipping.of(stack, opened.capture.mask().reshape(-1))
+        mask = opened.capture.mask()
+        clipping = Clipping.of(stack, mask.reshape(-1))
+        if (dark := dark_frames(stack, opened.lights, mask)).any():
+            missing = [stack.frames[row] for row in np.flatnonzero(dark)]
+            findings.add_doubt(dark_sentence(missing, "light from there is missing; take them again, or out of the frames"))
     with timings.part("matte"):
         matte = frame_matte(request, opened.capture, stack)
         mattes.add(matte)

@@ -1,9 +1,13 @@
 """Open a capture for a solve: its method, its lights, and its images as a stack."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
 
 from kernels import device as devices
 from service.errors import RequestError
+from service.light_estimation.dark_lights import dark_frames, dark_sentence
 from service.reporting.progress import Timings
 from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
 from service.sharing.sharing import SharedSolve
@@ -18,12 +22,15 @@ from stage.capture.manifest import FILE_NAME
 from stage.capture.point_lights import DistantLights, PlacedLights, distance_is_missing
 from stage.errors import ManifestError
 from stage.motion.tracking import tracking_frames
-from stage.stack.brackets import merge_brackets, one_frame_a_light
+from stage.stack.brackets import chosen_frames, merge_brackets, one_frame_a_light
 from stage.stack.ingest import open_stack
+from stage.stack.stack import Stack
 
 if TYPE_CHECKING:
     from service.solve.lights.refined_lights import RefinedLights
     from service.solve.lights.unknown_lights import UnknownLights
+
+Lights = TypeVar("Lights", bound=DistantLights | PlacedLights)
 
 
 class Opened(NamedTuple):
@@ -89,6 +96,8 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
             stack, lights, pairs = separate_pairs(stack, capture, lights, mask)
         else:
             stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
+            if over_time is None:  # steps share the lights of the first
+                capture, stack, lights = _without_dark_frames(capture, stack, lights, mask)
     if sharing is not None:
         sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
@@ -108,6 +117,15 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
     return Opened(capture, method, used, lights, solver, given, facts, brighter=brighter, distance=distance)
+
+
+def _without_dark_frames(capture: Capture, stack: Stack, lights: Lights, mask: np.ndarray) -> tuple[Capture, Stack, Lights]:
+    """Leave out the frames whose lamp did not burn; the capture has a doubt about them."""
+    dark = dark_frames(stack, lights, mask)
+    if not dark.any():
+        return capture, stack, lights
+    doubt = dark_sentence([stack.frames[row] for row in np.flatnonzero(dark)], "left out")
+    return replace(capture, doubts=(*capture.doubts, doubt)), *chosen_frames(stack, lights, ~dark)
 
 
 def _default_method(capture: Capture, *, unknown: bool) -> Method:

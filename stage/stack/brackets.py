@@ -138,10 +138,16 @@ def one_frame_a_light(stack: Stack, lights: Lights) -> tuple[Stack, Lights]:
     first = np.ones(stack.light_count, dtype=bool)
     for bracket in stack.brackets:
         first[bracket.rows[1:]] = False
-    chosen = np.flatnonzero(first)
-    kept = np.pad(chosen, (0, padded(len(chosen), LIGHT_PAD) - len(chosen)))
-    scale = np.where(np.arange(len(kept)) < len(chosen), stack.scale[kept], 0)
-    picked = {name: values if name == "centre" else values[chosen] for name, values in lights._asdict().items()}
-    frames = tuple(stack.frames[row] for row in chosen)
-    return replace(stack, frames=frames, scale=scale.astype(np.float32), kept=kept), type(lights)(**picked)
+    return chosen_frames(stack, lights, first)
 
+
+def chosen_frames(stack: Stack, lights: Lights, chosen: np.ndarray) -> tuple[Stack, Lights]:
+    """Return a stack of some of the frames, and their lights. `chosen`: [lights] bool."""
+    if not isinstance(stack, BracketedStack):
+        stack = BracketedStack(stack.folder, stack.key, stack.frames, stack.scale, stack.pixel_count, stack.motion,
+                               kept=np.arange(len(stack.scale)), recorded=stack, whole_scale=stack.scale, clipped=stack.clipped)
+    rows = np.flatnonzero(chosen)
+    padding = np.zeros(padded(len(rows), LIGHT_PAD) - len(rows), dtype=np.int64)
+    picked = {name: values if name == "centre" else values[rows] for name, values in lights._asdict().items()}
+    return (replace(stack, frames=tuple(stack.frames[row] for row in rows), kept=np.concatenate([stack.kept[rows], padding]),
+                    scale=np.concatenate([stack.scale[rows], padding]).astype(np.float32)), type(lights)(**picked))
