@@ -44,8 +44,9 @@ an inverted object has 5 and more under a light, a white bowl whose walls look f
 LIT_INVERTED, LIT_WRONG, MORE_LIT = 0.85, 0.6, 0.05
 """An inverted surface is lit in all the shadows that it should cast (0.89 to 1), but where the right one casts some: then from the second
 part on, and by the third part more than where the inverse casts its own (0.05 to 0.7 on objects of several parts, whose heights have false
-steps; right ones as much less). In right hollows at most 0.77 is lit, in white ones under three to five lights 0.84, and their inverses
-cast no shadow, or one that is lit more."""
+steps; right ones as much less). Where an outline speaks for it, and the inverse casts many shadows, which that of a hollow does not, any
+more is enough. In right hollows at most 0.77 is lit, in white ones under three to five lights 0.84, and their inverses cast no shadow, or
+one that is lit more."""
 LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
 """Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
 INVERSE = np.diag([-1.0, -1.0, 1.0])
@@ -116,9 +117,12 @@ def _is_inverted(shadows: "_Shadows", edge: Outline, lights: int) -> bool | None
     if count < (LEAST_SHADOWS_ALONE if alone else max(LEAST_SHADOWS, LEAST_SHADOWS_A_LIGHT * min(lights, SHADOW_LIGHTS))):
         return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
     count_inverse, lit_inverse = shadows.of_inverse()
-    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= lit - MORE_LIT
+    ahead = MORE_LIT if alone or count_inverse < LEAST_SHADOWS_ALONE else 0.0
+    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= lit - ahead
     if alone:
         return many and explained and lit >= LIT_WRONG and edge.outward <= 0
+    if ahead == 0 and not explained and lit >= max(LIT_WRONG, lit_inverse - MORE_LIT):
+        return None
     if many or explained:
         return lit >= (LIT_WRONG if explained else LIT_INVERTED)
     return False if lit < LIT_INVERTED else None
