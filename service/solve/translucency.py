@@ -11,28 +11,22 @@ A body that scatters all colours alike, or much farther than its shadows are wid
 bodies in JPEG files.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from service.solve.base.solution import Solution, SolveInput
+from service.solve.squares import squares
 from stage.capture.point_lights import DistantLights
 
-SQUARE, MOST_SQUARES, MOST_LIGHTS = 32, 16, 24
-"""Pixels along a side of the squares of the image in which edges are looked for, and the most numbers of squares and of lights."""
+MOST_LIGHTS = 24
 SPANS = 1, 2, 4
 """Pixels between neighbours of the four on a line across an edge."""
-LEAST_COSINE = 0.25
-"""Least cosine between normal and light of readings that are compared: below, a small error of the normal makes a large one of them."""
 MOST_RATIO = 1.25
 """A reading more above the median of its pixel is a highlight."""
-LEAST_BRIGHT = 0.1
-"""Least part that a pixel reflects of what the brightest of its square does, in each colour: of darker ones noise is most."""
 LEAST_EDGES = 50
 LEAST_STEP = 0.5
 """Least difference over three spans in green: below, the edge may be noise."""
@@ -69,12 +63,12 @@ def find_translucency(given: SolveInput, lights: DistantLights, solution: Soluti
     if not (lights.irradiance > 0).all() or any(Path(name).suffix.lower() in JPEG for name in given.stack.frames):
         return None
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
-    squares = list(_ratios(given, lights, solution.normal, estimated))
-    red, _, blue = np.sum([albedo for albedo, _ in squares], axis=0) if squares else np.zeros(3)
+    found = list(squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS))
+    red, _, blue = np.sum([square.albedo.mean(axis=(0, 1)) for square in found], axis=0) if found else np.zeros(3)
     darker = 0 if red < blue else 2
     sharper, least, width = 0.0, 0.0, 0.0
     for span in SPANS:
-        edges = np.concatenate([_edges(ratio, span) for _, ratio in squares]) if squares else np.zeros((0, 4, 3))
+        edges = np.concatenate([_edges(square.ratio, span) for square in found]) if found else np.zeros((0, 4, 3))
         if len(edges) < LEAST_EDGES:
             continue
         inner, outer = edges[:, 2] - edges[:, 1], edges[:, 3] - edges[:, 0]
@@ -83,34 +77,12 @@ def find_translucency(given: SolveInput, lights: DistantLights, solution: Soluti
             continue
         sharp = passed / whole
         error = (inner - sharp * outer).std(axis=0) / passed / np.sqrt(len(edges))  # relative, of a ratio of means
-        found = float(sharp[darker] / sharp[2 - darker])
-        sharper, least = max(sharper, found), max(least, found * (1 - 2 * float(np.hypot(error[0], error[2]))))
+        ratio = float(sharp[darker] / sharp[2 - darker])
+        sharper, least = max(sharper, ratio), max(least, ratio * (1 - 2 * float(np.hypot(error[0], error[2]))))
         width = width or span / float(passed.mean())  # by the narrowest span that tells
     if least < LEAST_SHARPER:
         return None
     return Translucency(sharper, width, _lost(solution.normal, estimated, BLUR * width))
-
-
-def _ratios(given: SolveInput, lights: DistantLights, normal: np.ndarray,
-            estimated: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield for squares of the image the mean colour [3] and the readings over those that are expected, [lights, rows, cols, 3] float32:
-    about 1 where a pixel is lit, and NaN where that is not known."""
-    rows, cols = (max(1, length // SQUARE) for length in estimated.shape)
-    corners = [(SQUARE * row, SQUARE * col) for row in range(rows) for col in range(cols)]
-    inside = [corner for corner in corners if 2 * estimated[corner[0] :, corner[1] :][:SQUARE, :SQUARE].sum() > SQUARE * SQUARE]
-    for row, col in (inside[number] for number in (evenly(len(inside), MOST_SQUARES) if inside else ())):
-        place = np.arange(estimated.size).reshape(estimated.shape)[row : row + SQUARE, col : col + SQUARE]
-        pixels, chosen = place.reshape(-1), evenly(len(lights.direction), MOST_LIGHTS)
-        radiance, usable = given.stack.pick_radiance(pixels)
-        cosine = lights.direction[chosen] @ normal[:, pixels].astype(np.float64)
-        known = usable[chosen] & (cosine > LEAST_COSINE) & estimated.reshape(-1)[pixels]
-        expected = lights.irradiance[chosen][:, None] * np.maximum(cosine, LEAST_COSINE)[..., None]
-        albedo = np.where(known[..., None], radiance[chosen] / expected, np.inf).astype(np.float32)
-        median = np.take_along_axis(np.sort(albedo, axis=0), (known.sum(axis=0) // 2)[None, :, None], axis=0)[0]  # lit, where most are
-        told = np.isfinite(median) & (median > 0)
-        told &= median > LEAST_BRIGHT * np.max(median, axis=0, where=told, initial=0)
-        ratio = np.where(known[..., None] & told, albedo, np.nan) / np.where(told, median, 1)
-        yield np.where(told, median, 0).mean(axis=0), ratio.reshape(-1, *place.shape, 3)
 
 
 def _edges(ratio: np.ndarray, span: int) -> np.ndarray:

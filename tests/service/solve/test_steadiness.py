@@ -1,0 +1,48 @@
+"""Captures whose camera shook are told from steady ones by the texture of the object."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, shift
+
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
+from tests.scenes.captures import Scene, write_capture
+from tests.scenes.translucent import waves
+
+SIDE, LIGHTS = 96, 24
+
+
+def warnings(folder, *, shake_px=0.0, noise=0.002, contrast=0.25, seed=3):
+    """What a solve says of a textured surface, each image of which is moved at random."""
+    rng = np.random.default_rng(seed)
+    _, normal = waves(SIDE, seed)
+    up, turn = 1 - 0.5 * (np.arange(LIGHTS) + 0.5) / LIGHTS, np.pi * (1 + 5**0.5) * np.arange(LIGHTS)
+    across = np.sqrt(1 - up**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=1)
+    texture = gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.5)
+    albedo = np.exp(contrast * texture / texture.std())[..., None] * [0.5, 0.4, 0.3]
+    images = albedo * np.maximum(np.einsum("rcx,lx->lrc", normal, directions), 0)[..., None]
+    for image in images if shake_px else ():
+        image[:] = shift(image, (*rng.normal(0, shake_px, 2), 0), order=3, mode="nearest")
+    images = np.maximum(images + noise * rng.standard_normal(images.shape), 0)
+    full = np.ones((SIDE, SIDE), dtype=bool)
+    write_capture(folder / "capture", Scene(normal, albedo, full, directions, np.full((LIGHTS, 3), np.pi), images))
+    request = SolveRequest(capture=folder / "capture", out=folder / "out", method=Method.ROBUST, device="cpu")
+    return [warning for warning in solve(request).warnings if "image to image" in warning]
+
+
+@pytest.mark.parametrize("shake_px", [0.2, 0.5])
+def test_a_camera_that_shakes_is_named(tmp_path, shake_px):
+    """With a move that is not beyond that of the images, √2 times as far as along an axis, and at least half of it while it is small."""
+    found, = warnings(tmp_path, shake_px=shake_px)
+    told = float(found.split("moves by ")[1].split(" px")[0])
+    assert 0.5 * min(shake_px, 0.3) * 2**0.5 < told < 1.2 * shake_px * 2**0.5
+
+
+@pytest.mark.parametrize(("noise", "contrast"), [(0.002, 0.25), (0.02, 0.25), (0.002, 0.0), (0.02, 0.0)])
+def test_a_steady_one_is_not(tmp_path, noise, contrast):
+    assert not warnings(tmp_path, noise=noise, contrast=contrast)
+
+
+def test_without_texture_nothing_tells(tmp_path):
+    assert not warnings(tmp_path, shake_px=0.5, contrast=0.0)
