@@ -24,6 +24,8 @@ SHELF = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.
          Ball((0.2, -0.12, -1.3), 0.15, 0.5), Wall((0.12, 0.14, -1.2), (0.2, -0.3, 1), 0.6, half_m=(0.09, 0.07)))
 MIRRORS = (Wall((0, 0, -1.5), (-0.1, 0.1, 1), 0.7, texture=0.3), Wall((0, -0.3, 0), (0, 1, 0), 0.5, texture=0.2),
            Ball((-0.06, -0.1, -1.2), 0.15, mirror=True))
+TWICE = 6
+"""Number of the frame that shows the pattern of the one before."""
 MOVED_M = 0.024
 """By how much a ball moves during the patterns."""
 WIDE, PIXEL = World(shapes=()).rig.camera[0], 1 / World(shapes=()).rig.camera_focal
@@ -104,6 +106,10 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES.get(name, ONE),
                    light)
 
+    for name in ("Gray, white and black", "phase 16, 4 steps, Gray"):
+        code = list(CODES[name])
+        yield _run(f"{name}, one pattern shown twice in place of the next", False, World(shapes=SHELF),
+                   [*code[:TWICE], code[TWICE - 1], *code[TWICE + 1 :]], light, declared=code)
     for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "phase 16/18/21, 4 steps"):
         moments = [trace(World(shapes=(SHELF[0], SHELF[1]._replace(center_m=(x, 0.05, -1.15)), *SHELF[2:])))
                    for x in np.linspace(-0.15 - MOVED_M / 2, -0.15 + MOVED_M / 2, len(CODES[name]))]

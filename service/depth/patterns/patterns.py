@@ -22,6 +22,7 @@ from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
+from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
@@ -181,6 +182,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
+    wrong = wrong or check_frames(sample, codes.collected, frames, noise)
     wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, noise)
     waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
     wrong = wrong or waves.wrong

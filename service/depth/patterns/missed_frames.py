@@ -1,0 +1,72 @@
+"""Frames that do not show their pattern: dark or even where stripes are declared, or once more the picture before.
+
+A projector that misses a picture, or a camera that is triggered too late, leaves them. One bit is then the same everywhere, or that of
+another frame, and stripes far from each other are taken for one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from stage.capture.manifest import Frame
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Code, Collected
+from stage.patterns.kary import KaryCode
+from stage.patterns.phase import PhaseCode
+
+LIT_SIGMAS = 20.0
+"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that are compared."""
+DARK, BRIGHT, OTHERS = 0.25, 0.75, 0.05
+"""Parts of that difference below and above which a stripe is dark and bright, and the least share of both where a frame shows stripes."""
+EVEN = 0.98
+"""Share of the pixels that are dark, or bright, in a frame without stripes; and of those that are the same in two frames of one picture."""
+COARSER = 2
+"""Coarser bits or digits with stripes, between whose edges there are some of the finer one."""
+ALIKE, OTHER_WAVES = 1.5, 2
+"""Largest ratio of the periods of waves that are alike, and the least number of such frames that show stripes: where a scene is so narrow
+that a wave may be dark all over it, its opposite is bright all over it."""
+SAME_PART, SAME_SIGMAS = 0.1, 5.0
+"""Largest difference of two readings of one picture, as a part of the difference above, and in deviations of a reading."""
+
+
+def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], noise: NoiseModel) -> str | None:
+    """Return a sentence about the frames of a sample that do not show their pattern; None if all seem to."""
+    grey = sample.grey
+    whole = np.ptp(grey, axis=0)
+    deviation = np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0))
+    lit = sample.whole & (whole > LIT_SIGMAS * deviation)
+    if lit.sum() < ENOUGH:
+        return None
+    grey, whole, deviation = grey[:, lit], whole[lit], deviation[lit]
+    level = (grey - grey.min(axis=0)) / whole
+    dark, bright = (level < DARK).mean(axis=1), (level > BRIGHT).mean(axis=1)
+    stripes, even = np.minimum(dark, bright) >= OTHERS, np.maximum(dark, bright) >= EVEN
+    missed = sorted(row for code in collected.codes for row in _without_stripes(code, stripes, even))
+    if missed:
+        names, shows = ", ".join(frames[row].image for row in missed), "shows" if len(missed) == 1 else "show"
+        return f"frames: {names} {shows} no stripes, and others do: the projector has missed the pattern; take the sequence again"
+    near = np.maximum(SAME_PART * whole, SAME_SIGMAS * deviation)
+    for row in range(1, len(grey)):
+        if (stripes[row] and stripes[row - 1] and frames[row].pattern != frames[row - 1].pattern
+                and (np.abs(grey[row] - grey[row - 1]) < near).mean() >= EVEN):
+            return (f"frames: {frames[row].image} and {frames[row - 1].image} show the same, and other patterns are declared: the "
+                    "projector has missed one, or the camera was too early or late; take the sequence again")
+    return None
+
+
+def _without_stripes(code: Code, stripes: np.ndarray, even: np.ndarray) -> list[int]:
+    """Return the frames of a code that are even where the scene is wide enough to show stripes; `stripes`, `even`: [frames] bool."""
+    if isinstance(code, PhaseCode):
+        periods, rows = np.array(code.periods_px), np.array(code.frames)
+        alike = np.maximum(periods[:, None], periods) <= ALIKE * np.minimum(periods[:, None], periods)
+        return [int(rows[place]) for place in np.flatnonzero(even[rows])
+                if (others := alike[place] & ~even[rows]).sum() >= OTHER_WAVES and stripes[rows[others]].all()]
+    if not isinstance(code, BinaryCode | KaryCode) or (isinstance(code, KaryCode) and code.colors is not None):
+        return []
+    missed = [row for digit, row in enumerate(code.frames) if even[row] and stripes[list(code.frames[digit + 1 :])].sum() >= COARSER]
+    inverses = code.inverses if isinstance(code, BinaryCode) else None
+    for row, inverse in zip(code.frames, inverses, strict=True) if inverses is not None else ():
+        missed += [one for one, other in ((row, inverse), (inverse, row)) if even[one] and stripes[other] and one not in missed]
+    return missed

@@ -1,0 +1,65 @@
+"""Frames that the projector missed are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest
+from tests.scenes.captures import write_exr, write_image
+from tests.scenes.depth import AMBIENT, BLACK_WHITE, gray_patterns, make_scene, manifest, phase_patterns, shown
+
+NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
+INVERSES = gray_patterns("column", stripe=2)
+PLAIN = [*BLACK_WHITE, *gray_patterns("column", stripe=2, inverse=False)]
+WAVES = [*phase_patterns("column", 16.0, 3), *phase_patterns("column", 18.0, 3), *phase_patterns("column", 21.0, 3)]
+KARY = [*BLACK_WHITE, *({"code": "kary", "axis": "column", "base": 3, "digits": 4, "digit": digit, "stripe_px": 2, "levels": [0, 0.5, 1]}
+                        for digit in reversed(range(4)))]
+NOISE = 0.003
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+def measured(folder, scene, patterns, *, dark=(), again=(), columns=None):
+    """What relit depth says of frames of which some are dark, and some show once more what the frame before shows, and what it makes of
+    some columns of them."""
+    rng = np.random.default_rng(4)
+    frames, before = [], np.zeros(scene.depth.shape)
+    for number, pattern in enumerate(patterns):
+        before = before if number in again else shown(pattern, scene.uv) * (number not in dark)
+        image = scene.albedo[..., 1] * (0.8 * before * ~scene.shaded + AMBIENT)
+        write_exr(folder / f"{number:02d}.exr", np.repeat((image + rng.normal(0, NOISE, image.shape))[..., None], 3, axis=-1))
+        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
+    mask = np.zeros(scene.depth.shape, np.uint8)
+    mask[:, columns or slice(None)] = 255
+    write_image(folder / "mask.png", mask)
+    (folder / "capture.json").write_text(json.dumps(manifest(frames, mask="mask.png")))
+    result = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+    return [warning for warning in result.warnings if "missed" in warning], result.maps.mask
+
+
+@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 1), (NUMBERED, 7), (INVERSES, 8), (INVERSES, 3), (PLAIN, 5), (WAVES, 4),
+                                                   (KARY, 5)],
+                         ids=["wave", "bit", "bit with inverse", "inverse", "bit without inverse", "one of several waves", "digit"])
+def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
+    said, solved = measured(tmp_path, scene, patterns, dark=[number])
+    assert f"{number:02d}.exr shows no stripes" in said[0] and not solved.any()
+
+
+@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (PLAIN, 5), (WAVES, 3), (KARY, 5)],
+                         ids=["wave", "bit", "inverse", "bit without inverse", "next wave", "digit"])
+def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, patterns, number):
+    said, solved = measured(tmp_path, scene, patterns, again=[number])
+    assert f"{number:02d}.exr and {number - 1:02d}.exr show the same" in said[0] and not solved.any()
+
+
+@pytest.mark.parametrize("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75)], ids=str)
+@pytest.mark.parametrize("patterns", [NUMBERED, INVERSES, PLAIN, WAVES, KARY, phase_patterns("column", 128.0)],
+                         ids=["numbered", "inverses", "without inverses", "waves", "digits", "one wave"])
+def test_bits_that_narrow_things_do_not_show_are_not_missed(tmp_path, scene, patterns, columns):
+    said, solved = measured(tmp_path, scene, patterns, columns=columns)
+    assert not said and solved.any()
