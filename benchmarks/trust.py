@@ -44,8 +44,8 @@ HEAD = """# How far confidence can be trusted
 - *Model*: whether the scene is one that the method's model describes.
 - No sentence and no σ tells of a light source of a time-of-flight camera that stands aside and is not declared: it makes all frequencies
   wrong by the same length, so that nothing in the frames contradicts it.
-- A camera that shakes is told by the texture of the object; no sentence tells of one that drifts slowly while the lamps burn row by row:
-  2 px over 48 images turn normals of *figure* by 5° in the median, and 3.8 % of them lie beyond five σ.
+- A camera that shakes, or drifts while the lamps burn row by row, is told by the texture of the object: not where there is none or little.
+  2 px over 48 images turn normals of *figure* by 5° in the median.
 - Of a translucent body normals are told to be blurred by the edges of its shadows in red and in blue: not where few shadows fall on it,
   in JPEG files, where it scatters all colours alike, or where light runs much farther in it than its shadows are wide.
 

@@ -25,7 +25,7 @@ from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
-from service.solve.steadiness import find_moves, moves_sentence
+from service.solve.steadiness import find_drift, find_moves, moves_sentence
 from service.solve.translucency import find_translucency
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
@@ -105,6 +105,10 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         moves_px = find_moves(given, opened.lights, solution)
         if moves_px is not None:
             solution.warnings.append(moves_sentence(moves_px))
+        drift = find_drift(given, opened.lights, solution)
+        if drift is not None:
+            solution.warnings.append(drift.sentence)
+            raise_error(solution, drift.degrees)
         translucency = find_translucency(given, opened.lights, solution)
         if translucency is not None:
             solution.warnings.append(translucency.sentence)

@@ -20,6 +20,7 @@ LEAST_BRIGHT = 0.1
 class Square(NamedTuple):
     """Readings of a square."""
 
+    place: np.ndarray  # [rows, cols] row-major positions in the image
     albedo: np.ndarray  # [rows, cols, 3] float32, median over the lights; 0 where it is not known
     ratio: np.ndarray  # [lights, rows, cols, 3] float32, readings over expected ones: about 1 where a pixel is lit, NaN where not known
 
@@ -48,4 +49,4 @@ def squares(given: SolveInput, lights: DistantLights, normal: np.ndarray, estima
         told = np.isfinite(median) & (median > 0)
         told &= median > LEAST_BRIGHT * np.max(median, axis=0, where=told, initial=0)
         ratio = np.where(known[..., None] & told, albedo, np.nan) / np.where(told, median, 1)
-        yield Square(np.where(told, median, 0).reshape(*place.shape, 3), ratio.reshape(-1, *place.shape, 3))
+        yield Square(place, np.where(told, median, 0).reshape(*place.shape, 3), ratio.reshape(-1, *place.shape, 3))
