@@ -100,15 +100,12 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if given.pairs is not None:
         _say_of_pairs(given, opened.method, solution)
     given.timings.stage("diagnosis", 1)
+    said = len(solution.warnings)
     diagnose(given, opened.capture, opened.lights, opened.declared, solution)
     if isinstance(opened.lights, DistantLights):
-        moves_px = find_moves(given, opened.lights, solution)
-        if moves_px is not None:
-            solution.warnings.append(moves_sentence(moves_px))
-        drift = find_drift(given, opened.lights, solution)
-        if drift is not None:
-            solution.warnings.append(drift.sentence)
-            raise_error(solution, drift.degrees)
+        # highlights bend what least squares makes of texture, and lights that are wrong move everything
+        if opened.method is not Method.LAMBERT and len(solution.warnings) == said:
+            _say_of_motion(given, opened.lights, solution)
         translucency = find_translucency(given, opened.lights, solution)
         if translucency is not None:
             solution.warnings.append(translucency.sentence)
@@ -200,6 +197,17 @@ def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera)
                      integrability.doubt(normal, solution.height, part, camera, shared=solution.shared_misfit))
     sigma = integrability.beside_parts(shown, part).reshape(-1)
     solution.sigma = np.where(np.isin(solution.status, ESTIMATED), sigma, solution.sigma).astype(np.float16)
+
+
+def _say_of_motion(given: SolveInput, lights: DistantLights, solution: Solution) -> None:
+    """Say whether the frames show the object at the same place, and make normals less sure where a drift has turned them."""
+    moves_px = find_moves(given, lights, solution)
+    if moves_px is not None:
+        solution.warnings.append(moves_sentence(moves_px))
+    drift = find_drift(given, lights, solution)
+    if drift is not None:
+        solution.warnings.append(drift.sentence)
+        raise_error(solution, drift.degrees)
 
 
 def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None:
