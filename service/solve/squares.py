@@ -36,9 +36,9 @@ def squares(given: SolveInput, lights: DistantLights, normal: np.ndarray, estima
     rows, cols = (max(1, length // SIDE) for length in estimated.shape)
     corners = [(SIDE * row, SIDE * col) for row in range(rows) for col in range(cols)]
     inside = [corner for corner in corners if 2 * estimated[corner[0] :, corner[1] :][:SIDE, :SIDE].sum() > SIDE * SIDE]
-    chosen = evenly(len(lights.direction), most_lights)
+    chosen, (height, width) = evenly(len(lights.direction), most_lights), estimated.shape
     for row, col in (inside[number] for number in (evenly(len(inside), MOST_SQUARES) if inside else ())):
-        place = np.arange(estimated.size).reshape(estimated.shape)[row : row + SIDE, col : col + SIDE]
+        place = np.arange(row, min(row + SIDE, height))[:, None] * width + np.arange(col, min(col + SIDE, width))
         pixels = place.reshape(-1)
         radiance, usable = given.stack.pick_radiance(pixels)
         cosine = lights.direction[chosen] @ normal[:, pixels].astype(np.float64)

@@ -31,8 +31,6 @@ LEAST_TEXTURE = 8.0
 LEAST_PX, LEAST_ALIKE = 0.1, 0.75
 """Least root mean square move, and correlation of the moves that both halves tell: 0.08 px and 0.6 at most of steady captures of texture,
 real and path-traced, 0.15 px and 0.8 to 0.99 of those that shake by 0.4 px."""
-
-
 LEAST_Z, SURE_DEGREES = 0.35, 8.0
 """Least z of a normal, and largest σ, at places whose curl is compared."""
 MOST_CURL, LEAST_BEND, MOST_BEND = 0.3, 0.02, 0.6
@@ -90,6 +88,8 @@ class Drift(NamedTuple):
 
 def find_drift(given: SolveInput, lights: DistantLights, solution: Solution) -> Drift | None:
     """Return the move along with the direction of the light that the curl of the slopes tells, or None."""
+    if not (lights.irradiance > 0).all():
+        return None
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     curls: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     bends: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
