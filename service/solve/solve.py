@@ -25,7 +25,7 @@ from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
-from service.solve.steadiness import find_drift, find_moves, moves_sentence
+from service.solve.steadiness import find_motion
 from service.solve.translucency import find_translucency
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
@@ -105,7 +105,10 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if isinstance(opened.lights, DistantLights):
         # highlights bend what least squares makes of texture, and lights that are wrong move everything
         if opened.method is not Method.LAMBERT and len(solution.warnings) == said:
-            _say_of_motion(given, opened.lights, solution)
+            motion = find_motion(given, opened.lights, solution)
+            solution.warnings += motion.sentences
+            if motion.drift is not None:
+                raise_error(solution, motion.drift.degrees)
         translucency = find_translucency(given, opened.lights, solution)
         if translucency is not None:
             solution.warnings.append(translucency.sentence)
@@ -197,17 +200,6 @@ def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera)
                      integrability.doubt(normal, solution.height, part, camera, shared=solution.shared_misfit))
     sigma = integrability.beside_parts(shown, part).reshape(-1)
     solution.sigma = np.where(np.isin(solution.status, ESTIMATED), sigma, solution.sigma).astype(np.float16)
-
-
-def _say_of_motion(given: SolveInput, lights: DistantLights, solution: Solution) -> None:
-    """Say whether the frames show the object at the same place, and make normals less sure where a drift has turned them."""
-    moves_px = find_moves(given, lights, solution)
-    if moves_px is not None:
-        solution.warnings.append(moves_sentence(moves_px))
-    drift = find_drift(given, lights, solution)
-    if drift is not None:
-        solution.warnings.append(drift.sentence)
-        raise_error(solution, drift.degrees)
 
 
 def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None:

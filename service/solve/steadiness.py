@@ -17,7 +17,7 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from service.solve.base.solution import Solution, SolveInput
-from service.solve.squares import squares
+from service.solve.squares import Square, squares
 from stage.capture.point_lights import DistantLights
 
 MOST_LIGHTS, LEAST_LIGHTS = 64, 8
@@ -41,14 +41,53 @@ LEAST_DRIFT, SURE = 0.1, 5.0
 steady captures, real and path-traced, and 0.3 to 0.6 (`robust`) for a drift of a pixel."""
 
 
-def find_moves(given: SolveInput, lights: DistantLights, solution: Solution) -> float | None:
-    """Return how far frames are moved against each other, root mean square in pixels and rather too little; None if they seem steady."""
-    if len(lights.direction) < LEAST_LIGHTS or not (lights.irradiance > 0).all():
+class Drift(NamedTuple):
+    """A slow move along with the direction of the light."""
+
+    px: float
+    """The move while the light goes from one side to the other."""
+    degrees: np.ndarray  # [pixels of the image] float32, error that it makes of normals
+
+    @property
+    def sentence(self) -> str:
+        """What is said of it."""
+        return (f"frames: what the camera sees moves by some {self.px:.1g} px while the light goes from one side to the other, as of a "
+                "camera that sinks while lamps burn row by row: texture has turned the normals, and the layer sigma holds what that makes; "
+                "fix camera and object, or align the images first")
+
+
+class Motion(NamedTuple):
+    """Moves of the frames against each other."""
+
+    shake_px: float | None
+    """From frame to frame, root mean square and rather too little; None where frames seem steady."""
+    drift: Drift | None
+
+    @property
+    def sentences(self) -> list[str]:
+        """What is said of it."""
+        shaken = [] if self.shake_px is None else [
+            f"frames: what the camera sees moves by {self.shake_px:.2g} px or more from image to image, as of a camera held by hand or a "
+            "stage that shakes: edges blur, and texture turns normals; fix both, or align the images first"]
+        return shaken if self.drift is None else [*shaken, self.drift.sentence]
+
+
+def find_motion(given: SolveInput, lights: DistantLights, solution: Solution) -> Motion:
+    """Return how the frames of a solve are moved against each other."""
+    if not (lights.irradiance > 0).all():
+        return Motion(None, None)
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    seen = list(squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS))
+    return Motion(_shake(lights.direction[evenly(len(lights.direction), MOST_LIGHTS)], seen), _drift(lights, solution, estimated, seen))
+
+
+def _shake(directions: np.ndarray, seen: list[Square]) -> float | None:
+    """Return how far frames are moved against each other, root mean square; None if they seem steady. `directions`: [lights, 3]."""
+    count = len(directions)
+    if count < LEAST_LIGHTS:
         return None
-    directions = lights.direction[evenly(len(lights.direction), MOST_LIGHTS)]
-    count, estimated = len(directions), np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     matrix, vector = np.zeros((2, count, 2, 2)), np.zeros((2, count, 2))
-    for square in squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS):
+    for square in seen:
         grey = np.where((square.albedo > 0).all(axis=-1), square.albedo.mean(axis=-1), np.nan)
         down, right = np.gradient(np.log(grey))
         steps = np.stack([down, right], axis=-1)
@@ -71,29 +110,11 @@ def find_moves(given: SolveInput, lights: DistantLights, solution: Solution) -> 
     return px if px >= LEAST_PX and both >= LEAST_ALIKE * each else None
 
 
-class Drift(NamedTuple):
-    """A slow move along with the direction of the light."""
-
-    px: float
-    """The move while the light goes from one side to the other."""
-    degrees: np.ndarray  # [pixels of the image] float32, error that it makes of normals
-
-    @property
-    def sentence(self) -> str:
-        """What is said of it."""
-        return (f"frames: what the camera sees moves by some {self.px:.1g} px while the light goes from one side to the other, as of a "
-                "camera that sinks while lamps burn row by row: texture has turned the normals, and the layer sigma holds what that makes; "
-                "fix camera and object, or align the images first")
-
-
-def find_drift(given: SolveInput, lights: DistantLights, solution: Solution) -> Drift | None:
+def _drift(lights: DistantLights, solution: Solution, estimated: np.ndarray, seen: list[Square]) -> Drift | None:
     """Return the move along with the direction of the light that the curl of the slopes tells, or None."""
-    if not (lights.irradiance > 0).all():
-        return None
-    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     curls: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     bends: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for square in squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS):
+    for square in seen:
         sure = (square.albedo > 0).all(axis=-1) & (solution.sigma[square.place] < SURE_DEGREES)
         x, y, z = solution.normal[:, square.place]
         sure &= z > LEAST_Z
@@ -115,7 +136,7 @@ def find_drift(given: SolveInput, lights: DistantLights, solution: Solution) -> 
     if not alike.any():
         return None
     slope = float(np.abs(found.mean(axis=0))[alike].max())
-    albedo = solution.albedo.astype(np.float32).mean(axis=0).reshape(given.mask.shape)
+    albedo = solution.albedo.astype(np.float32).mean(axis=0).reshape(estimated.shape)
     steps = np.gradient(np.log(np.where(estimated & (albedo > 0), albedo, np.nan)))
     degrees = np.nan_to_num(np.degrees(np.minimum(slope * np.hypot(*steps), 1.0))).reshape(-1)
     return Drift(slope * float(np.ptp(lights.direction[:, :2], axis=0).max()), degrees.astype(np.float32))
@@ -130,9 +151,3 @@ def _fit(curl: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         spread = 1.5 * np.median(np.abs(curl - bend @ found)) + 1e-6
         weight = 1 / (1 + ((curl - bend @ found) / spread) ** 2)
     return found, spread * np.sqrt(np.diag(np.linalg.inv(normal)))
-
-
-def moves_sentence(px: float) -> str:
-    """Return what is said of frames that move."""
-    return (f"frames: what the camera sees moves by {px:.2g} px or more from image to image, as of a camera held by hand or a stage that "
-            "shakes: edges blur, and texture turns normals; fix both, or align the images first")
