@@ -14,7 +14,8 @@ from service.calibrate.results import calibrated_camera, lens_facts, manifests_t
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.patterns import decoded_bands, full_scale, read_codes, scene_colour
+from service.depth.patterns.frame_light import full_scale, scene_colour
+from service.depth.patterns.patterns import decoded_bands, read_codes
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
 from service.requests.depth import DepthRequest

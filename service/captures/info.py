@@ -317,8 +317,8 @@ def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.
                     np.array([frame.exposure_s or 1.0 for frame, _ in lit]), capture.manifest.color_space)
     dark = dark_lights(grey_readings(radiance, sample.irradiance), sample.directions)
     if dark.any():
-        images = [lit[row][0].image for row in np.flatnonzero(dark)]
-        return Findings([dark_sentence(images, "take them again, or out of the frames; a solve leaves them out")], {})
+        images = [frame.image for frame, _ in lit]
+        return Findings([dark_sentence(images, dark, "take them again, or out of the frames; a solve leaves them out")], {})
     fit = fit_manifest(sample)
     if (found := better_explanation(sample, fit)) is not None:
         return Findings([explanation_sentence(found, sample)], {})

@@ -51,16 +51,18 @@ def dark_lights(readings: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return dark if few else np.zeros_like(dark)
 
 
-def dark_sentence(images: Sequence[str], what: str) -> str:
-    """Return a sentence about images whose lamps did not burn. `what`: is done about them, or can be."""
-    are = "is" if len(images) == 1 else "are"
-    return (f"frames: {', '.join(images)} {are} dark, though the light stands before the object, as where a lamp did not burn or the "
+def dark_sentence(images: Sequence[str], dark: np.ndarray, what: str) -> str:
+    """Return a sentence about the images, of each light, whose lamps did not burn. `dark`: [lights] bool. `what`: is done about them, or
+    can be."""
+    named = [image for image, is_dark in zip(images, dark, strict=True) if is_dark]
+    are = "is" if len(named) == 1 else "are"
+    return (f"frames: {', '.join(named)} {are} dark, though the light stands before the object, as where a lamp did not burn or the "
             f"shutter missed it: {what}")
 
 
 def _means(stack: Stack, irradiance: np.ndarray, inside: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Return the mean of all pixels of the object in chosen frames, [chosen] radiance over irradiance."""
-    rows, total = np.flatnonzero(chosen), np.zeros((len(np.flatnonzero(chosen)), 3))
+    rows, total = np.flatnonzero(chosen), np.zeros((chosen.sum(), 3))
     for start, stop in stack.bands():
         within = np.flatnonzero(inside[start:stop])
         total += stack.band(start, stop)[:, rows][:, :, within].sum(axis=2, dtype=np.float64).T

@@ -144,8 +144,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         mask = opened.capture.mask()
         clipping = Clipping.of(stack, mask.reshape(-1))
         if (dark := dark_frames(stack, opened.lights, mask)).any():
-            missing = [stack.frames[row] for row in np.flatnonzero(dark)]
-            findings.add_doubt(dark_sentence(missing, "light from there is missing; take them again, or out of the frames"))
+            findings.add_doubt(dark_sentence(stack.frames, dark, "light from there is missing; take them again, or out of the frames"))
     with timings.part("matte"):
         matte = frame_matte(request, opened.capture, stack)
         mattes.add(matte)

@@ -124,7 +124,7 @@ def _without_dark_frames(capture: Capture, stack: Stack, lights: Lights, mask: n
     dark = dark_frames(stack, lights, mask)
     if not dark.any():
         return capture, stack, lights
-    doubt = dark_sentence([stack.frames[row] for row in np.flatnonzero(dark)], "left out")
+    doubt = dark_sentence(stack.frames, dark, "left out")
     return replace(capture, doubts=(*capture.doubts, doubt)), *chosen_frames(stack, lights, ~dark)
 
 

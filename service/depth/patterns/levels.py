@@ -16,7 +16,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from kernels.structured.response import bent_wave, fitted_curve
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, LIT_SIGMAS, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -27,8 +27,6 @@ LEAST_PART, WAVE_PART = 0.04, 0.02
 """The same as a part of the largest difference of two readings of the pixel, for pairs and for waves: lamps flicker by less."""
 CLEAR_BIT = 0.85
 """Least difference of a bit and its inverse, as a part of the largest of the pixel's bits, with which its sum is compared."""
-LIT_SIGMAS = 20.0
-"""Least of that largest difference, in deviations of a reading, of pixels that tell whether frames are mixed."""
 BETWEEN, SEVERAL = (0.25, 0.75), 2
 """Levels between the darkest and the brightest bit of a pixel that no stripe has, and number of frames of a pixel that must have them, of
 its coarse bits, white and black: at the edge of a stripe of a Gray code one bit is between the two, and no other."""
@@ -129,7 +127,7 @@ def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray
 def check_levels(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
     """Return a sentence if much of a sample has levels that no pattern has."""
     grey = sample.grey
-    lit = sample.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
+    lit = sample.lit(grey, noise)
     if lit.sum() < ENOUGH:
         return None
     levels = EvenLevels.of(collected, len(grey), projector.response)

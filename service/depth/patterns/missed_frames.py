@@ -16,10 +16,9 @@ from stage.patterns.codes import Code, Collected
 from stage.patterns.kary import KaryCode
 from stage.patterns.phase import PhaseCode
 
-LIT_SIGMAS = 20.0
-"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that are compared."""
 DARK, BRIGHT, OTHERS = 0.25, 0.75, 0.05
-"""Parts of that difference below and above which a stripe is dark and bright, and the least share of both where a frame shows stripes."""
+"""Parts of the difference of a pixel's brightest and darkest reading below and above which a stripe is dark and bright, and the least share
+of both where a frame shows stripes."""
 EVEN = 0.98
 """Share of the pixels that are dark, or bright, in a frame without stripes; and of those that are the same in two frames of one picture."""
 COARSER = 2
@@ -28,18 +27,17 @@ ALIKE, OTHER_WAVES = 1.5, 2
 """Largest ratio of the periods of waves that are alike, and the least number of such frames that show stripes: where a scene is so narrow
 that a wave may be dark all over it, its opposite is bright all over it."""
 SAME_PART, SAME_SIGMAS = 0.1, 5.0
-"""Largest difference of two readings of one picture, as a part of the difference above, and in deviations of a reading."""
+"""Largest difference of two readings of one picture, as a part of that difference, and in deviations of a reading."""
 
 
 def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], noise: NoiseModel) -> str | None:
     """Return a sentence about the frames of a sample that do not show their pattern; None if all seem to."""
     grey = sample.grey
-    whole = np.ptp(grey, axis=0)
-    deviation = np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0))
-    lit = sample.whole & (whole > LIT_SIGMAS * deviation)
+    lit = sample.lit(grey, noise)
     if lit.sum() < ENOUGH:
         return None
-    grey, whole, deviation = grey[:, lit], whole[lit], deviation[lit]
+    grey = grey[:, lit]
+    whole = np.ptp(grey, axis=0)
     level = (grey - grey.min(axis=0)) / whole
     dark, bright = (level < DARK).mean(axis=1), (level > BRIGHT).mean(axis=1)
     stripes, even = np.minimum(dark, bright) >= OTHERS, np.maximum(dark, bright) >= EVEN
@@ -47,7 +45,7 @@ def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], 
     if missed:
         names, shows = ", ".join(frames[row].image for row in missed), "shows" if len(missed) == 1 else "show"
         return f"frames: {names} {shows} no stripes, and others do: the projector has missed the pattern; take the sequence again"
-    near = np.maximum(SAME_PART * whole, SAME_SIGMAS * deviation)
+    near = np.maximum(SAME_PART * whole, SAME_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
     for row in range(1, len(grey)):
         if (stripes[row] and stripes[row - 1] and frames[row].pattern != frames[row - 1].pattern
                 and (np.abs(grey[row] - grey[row - 1]) < near).mean() >= EVEN):

@@ -49,6 +49,9 @@ BAD_FIT, BETTER_FIT = 3.0, 0.5
 """Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
 FULL_PART = 0.999
 """Part of the largest reading of a sample from which on one may be clipped: corrections of the frames leave clipped ones that even."""
+LIT_SIGMAS = 20.0
+"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that tell whether frames show
+their patterns."""
 LEAST_SIGNAL = 20.0
 """Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
 
@@ -79,6 +82,11 @@ class Sample(NamedTuple):
         bright = self.values.max(axis=(0, 1))
         inside = self.mask.ravel() & (bright < FULL_PART * bright.max(initial=0.0))
         return inside if self.saturated is None else inside & ~self.saturated.any(axis=0)
+
+    def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return [pixels] bool: the whole ones that the patterns change by far more than noise, of their readings `grey`."""
+        deviation = np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0))
+        return self.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * deviation)
 
 
 def sample_of(planes: Planes, camera: Camera, mask: np.ndarray) -> Sample:

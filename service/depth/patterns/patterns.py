@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from math import ceil
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,13 +19,14 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
+from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
-from service.depth.patterns.readings import Readings, even_light
+from service.depth.patterns.readings import Readings
 from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
@@ -35,20 +35,13 @@ from service.requests.depth import DepthRequest
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Frame
 from stage.capture.projector import Projector
-from stage.colour.colour_spaces import is_linear
 from stage.errors import ManifestError
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, collect
 from stage.patterns.kary import KaryCode
-from stage.patterns.modulated import ModulatedCode
-from stage.stack.correction import Correction
 from stage.stack.pattern_exposures import JoinedExposures, frames_shown
 from stage.stack.planes import Planes, frame_planes
 
-SCALE_PERCENTILE = 99.9
-"""Percentile of the brightest frame that is taken for full scale, for images in floating point without a given saturation."""
-SCALE_SAMPLE = 500_000
-"""Number of pixels of a frame from which full scale is taken."""
 DECODE_BYTES_PER_PIXEL = 200
 """Memory that decoding and triangulation take for each pixel, beside the planes."""
 
@@ -319,35 +312,3 @@ def projector_model(projector: Projector) -> ProjectorModel:
     return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
                           lens.k if lens is not None else (0.0, 0.0, 0.0), lens.p if lens is not None else (0.0, 0.0),
                           projector.projector_from_camera())
-
-
-def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
-    """Return the largest reading there can be, in the unit of the corrected images."""
-    exposure = min((frame.exposure_s for frame in frames if frame.exposure_s is not None), default=1.0)
-    manifest = capture.manifest
-    integers = all(Path(frame.image).suffix.lower() in (".png", ".jpg", ".jpeg") for frame in frames)
-    if integers or not is_linear(manifest.color_space):
-        return 1.0 / exposure
-    if manifest.saturation is not None:
-        return manifest.saturation / exposure
-    every = max(1, planes.values[0].size // SCALE_SAMPLE)
-    return max(float(max(np.percentile(frame.reshape(-1)[::every], SCALE_PERCENTILE) for frame in planes.values)), 1e-12)
-
-
-def scene_colour(capture: Capture, frames: list[Frame], collected: Collected, joined: JoinedExposures | None = None) -> np.ndarray | None:
-    """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light,
-    else the mean of a wave over its shifts; None if the capture has none of them."""
-    parts = {collected.white: 1.0} if collected.white is not None else {}
-    for code in collected.codes:
-        if not parts and isinstance(code, BinaryCode) and code.inverses is not None:
-            parts = {code.frames[0]: 1.0, code.inverses[0]: 1.0}
-    waves = even_light(collected)
-    if not parts and waves is not None:
-        parts = dict(zip(waves.frames, waves.weights[:, 0], strict=True))
-    for code in collected.codes:
-        if not parts and isinstance(code, ModulatedCode):
-            parts = {number: 1.0 for step in code.frames for number in step}
-    if not parts:
-        return None
-    read = Correction.of(capture).apply if joined is None else joined.read
-    return np.asarray(np.sum([weight * read(frames[number]).pixels for number, weight in parts.items()], axis=0))

@@ -12,7 +12,7 @@ from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
-from service.depth.patterns.patterns import full_scale
+from service.depth.patterns.frame_light import full_scale
 from service.depth.stereo.rectification import Rectification, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import LEAST_PLACES, MOST_LABELS, SURE_LEAD, Disparity, Places, match, range_of, unique_places
 from service.reporting.progress import Timings

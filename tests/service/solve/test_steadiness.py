@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter, shift
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from tests.scenes.captures import Scene, angles_degrees, write_capture
+from tests.scenes.parts import sphere_lights
 from tests.scenes.translucent import waves
 
 SIDE, LIGHTS = 96, 24
@@ -19,9 +20,7 @@ def solved(folder, *, shake_px=0.0, drift_px=0.0, noise=0.002, contrast=0.25, se
     and the error of each normal over its σ."""
     rng = np.random.default_rng(seed)
     _, normal = waves(SIDE, seed)
-    up, turn = 1 - 0.5 * (np.arange(LIGHTS) + 0.5) / LIGHTS, np.pi * (1 + 5**0.5) * np.arange(LIGHTS)
-    across = np.sqrt(1 - up**2)
-    directions = np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=1)
+    directions = sphere_lights(LIGHTS, least_z=0.5)
     texture = gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.5)
     albedo = np.exp(contrast * texture / texture.std())[..., None] * [0.5, 0.4, 0.3]
     images = albedo * np.maximum(np.einsum("rcx,lx->lrc", normal, directions), 0)[..., None]
