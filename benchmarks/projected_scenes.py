@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import convolve1d
+from scipy.ndimage import convolve1d, shift
 
 from stage.capture.manifest import Frame
 from stage.formats.images import write_png
@@ -272,7 +272,8 @@ def _focus(shown: np.ndarray, blur_px: float) -> np.ndarray:
 
 
 def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, light: Light | None = None,
-                  declared: Sequence[Pattern] | None = None, moments: Sequence[Light] | None = None, **projector: Any) -> Light:
+                  declared: Sequence[Pattern] | None = None, moments: Sequence[Light] | None = None,
+                  aside: Sequence[tuple[float, float]] | None = None, **projector: Any) -> Light:
     """Write a capture of these patterns.
 
     Args:
@@ -282,6 +283,7 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
         light: of `trace`, where the same world is captured again.
         declared: what the manifest says instead; None: the truth.
         moments: light of each frame, where something moves.
+        aside: by how many pixels each frame lies lower and farther right than the truth, where the camera moves.
         projector: further fields of the manifest's projector.
 
     Returns:
@@ -292,6 +294,8 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
     rig, entries = world.rig, []
     for number, (frame, pattern) in enumerate(zip(images(world, moments or light, patterns), declared or patterns, strict=True)):
         name = f"{number:03d}.png"
+        if aside is not None:
+            frame = shift(frame, aside[number], order=1, mode="nearest")
         write_png(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16), srgb=False)
         entries.append(Frame(image=name, pattern=pattern).model_dump(mode="json", exclude_defaults=True))
     (folder / "capture.json").write_text(json.dumps({

@@ -28,6 +28,8 @@ TWICE = 6
 """Number of the frame that shows the pattern of the one before."""
 MOVED_M = 0.024
 """By how much a ball moves during the patterns."""
+DRIFT_PX = 2.0
+"""By how much a camera drifts during the patterns."""
 WIDE, PIXEL = World(shapes=()).rig.camera[0], 1 / World(shapes=()).rig.camera_focal
 """Columns of the camera, and the side of a pixel at 1 m."""
 NEAR_M = -1.08
@@ -114,6 +116,10 @@ def trials(data: Path | None) -> Iterator[Trial]:
         moments = [trace(World(shapes=(SHELF[0], SHELF[1]._replace(center_m=(x, 0.05, -1.15)), *SHELF[2:])))
                    for x in np.linspace(-0.15 - MOVED_M / 2, -0.15 + MOVED_M / 2, len(CODES[name]))]
         yield _run(f"{name}, a ball moves by {1e3 * MOVED_M:g} mm", False, World(shapes=SHELF), CODES[name], light, moments=moments)
+    for name in ("Gray, inverses", "Gray, white and black", "binary", "k-ary, reflected", "k-ary, plain", "phase 16, 4 steps, Gray",
+                 "phase 16/18/21, 4 steps"):
+        yield _run(f"{name}, the camera drifts by {DRIFT_PX:g} px", False, World(shapes=SHELF), CODES[name], light,
+                   aside=[(0.0, right) for right in np.linspace(0, DRIFT_PX, len(CODES[name]))])
     seen, bare = trace(World(shapes=WIRES, samples=6)), trace(World(shapes=WIRES[:1], samples=1)).depth
     column = (np.arange(WIDE) + 0.5 - WIDE / 2) * PIXEL  # of the plane 1 m away, metres
     beside = np.min([np.abs(column - wire.point_m[0] / -NEAR_M) for wire in WIRES[1:]], axis=0) < 1.5 * PIXEL
@@ -158,6 +164,7 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
 
 def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,
          declared: Sequence[Pattern] | None = None, *, refined: bool = False, moments: Sequence[Light] | None = None,
+         aside: Sequence[tuple[float, float]] | None = None,
          others: Sequence[np.ndarray] = (), near: np.ndarray | None = None, **projector: object) -> Trial:
     """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth.
 
@@ -166,7 +173,7 @@ def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], l
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
         light = write_capture(capture, world, patterns, light=light,
-                              declared=declared, moments=moments, **projector)
+                              declared=declared, moments=moments, aside=aside, **projector)
         known = (light.lit if near is None else near) & np.isfinite(light.depth)
         try:
             found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=world.read_noise,

@@ -46,6 +46,8 @@ class Coordinates:
     columns: AxisMaps | None
     rows: AxisMaps | None
     amplitude: np.ndarray  # [rows, cols] float32 of the weaker axis: a pixel is as good as its worse axis
+    shift_px: float = 0.0
+    """Distance in camera pixels of the images that lie farthest aside of each other, 0 where none clearly does."""
 
     @classmethod
     def empty(cls, shape: tuple[int, ...], *, columns: bool, rows: bool) -> "Coordinates":

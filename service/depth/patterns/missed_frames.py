@@ -26,6 +26,8 @@ COARSER = 2
 ALIKE, OTHER_WAVES = 1.5, 2
 """Largest ratio of the periods of waves that are alike, and the least number of such frames that show stripes: where a scene is so narrow
 that a wave may be dark all over it, its opposite is bright all over it."""
+OPPOSITE = 0.9
+"""Least share of the pixels that are dark in a frame and bright in its inverse, or the reverse, where both show their patterns."""
 SAME_PART, SAME_SIGMAS = 0.1, 5.0
 """Largest difference of two readings of one picture, as a part of that difference, and in deviations of a reading."""
 
@@ -46,12 +48,30 @@ def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], 
         names, shows = ", ".join(frames[row].image for row in missed), "shows" if len(missed) == 1 else "show"
         return f"frames: {names} {shows} no stripes, and others do: the projector has missed the pattern; take the sequence again"
     near = np.maximum(SAME_PART * whole, SAME_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
+    judged = _judged(collected, level)
     for row in range(1, len(grey)):
-        if (stripes[row] and stripes[row - 1] and frames[row].pattern != frames[row - 1].pattern
+        if (judged[row] and stripes[row] and stripes[row - 1] and frames[row].pattern != frames[row - 1].pattern
                 and (np.abs(grey[row] - grey[row - 1]) < near).mean() >= EVEN):
             return (f"frames: {frames[row].image} and {frames[row - 1].image} show the same, and other patterns are declared: the "
                     "projector has missed one, or the camera was too early or late; take the sequence again")
     return None
+
+
+def _judged(collected: Collected, level: np.ndarray) -> np.ndarray:
+    """Return the frames, [frames] bool, that may not be alike the frame before; `level`: [frames, pixels] of each pixel's range.
+
+    Two bits of a binary or XOR code, and a bit and the inverse of another, are alike over half of the projector or a quarter. A bit that is
+    opposite to its own inverse shows its pattern.
+    """
+    judged = np.ones(len(level), bool)
+    for code in collected.codes:
+        if isinstance(code, BinaryCode) and code.inverses is not None:
+            frames, inverses = list(code.frames), list(code.inverses)
+            opposite = ((level[frames] < 0.5) != (level[inverses] < 0.5)).mean(axis=1) >= OPPOSITE
+            judged[frames] = judged[inverses] = ~opposite
+        elif isinstance(code, BinaryCode) and code.name != "gray":
+            judged[list(code.frames)] = False
+    return judged
 
 
 def _without_stripes(code: Code, stripes: np.ndarray, even: np.ndarray) -> list[int]:

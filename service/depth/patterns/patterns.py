@@ -27,6 +27,7 @@ from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings
+from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
@@ -107,18 +108,19 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                 coordinates.put(band, mask[band], decoded)
                 timings.advance(band.stop)
             if declared:
-                warnings += widen_lagging(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)[0]
-                widen_mixed(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)
+                warnings += _widen(planes, coordinates, codes, frames, noise)[0]
         else:
-            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
-                                     declared=declared)
-        moved, said = _moved(planes, mask, capture, codes.collected, noise)
+            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, frames, noise, device, request,
+                                     timings, declared=declared)
+        moved, said = _moved(planes, mask, capture, codes.collected, noise, shifted=coordinates.shift_px > 0)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
     warnings += said
     facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
+    if coordinates.shift_px:
+        facts["image_shift_px"] = float(f"{coordinates.shift_px:.3g}")
     if series is not None and joined is not None:
         facts |= {"exposures_s": list(series.times_s), "pixels_of_exposures": list(joined.counts)}
     spanned = request.near_m is not None or request.far_m is not None  # which may be what refuses all depths
@@ -193,9 +195,10 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     return Checks(said, codes, True)
 
 
-def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel) -> tuple[np.ndarray, list[str]]:
+def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel, *,
+           shifted: bool) -> tuple[np.ndarray, list[str]]:
     """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
-    if it is everywhere, where most stripes are read rightly all the same."""
+    if it is everywhere, where most stripes are read rightly all the same. `shifted`: whether it is said already that images have."""
     sample = sample_of(planes, capture.camera, mask)
     sums = EvenSums.of(sample, collected, noise)
     moved = np.zeros(mask.shape, bool)
@@ -211,9 +214,9 @@ def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collec
     clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
     seen = f"frames[]: the even light of the frames differs at {100 * share:.2g} % of the pixels, as where "
     if sums.everywhere:
-        return np.zeros_like(moved), [f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two "
-                                      f"patterns{clipped}: the standard deviations do not hold what that makes; keep it still, or wait "
-                                      "longer for each pattern"]
+        return np.zeros_like(moved), [] if shifted else [
+            f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two patterns{clipped}: the "
+            "standard deviations do not hold what that makes; keep it still, or wait longer for each pattern"]
     return moved, [f"{seen}something has moved during the sequence{clipped}: they are unsure"]
 
 
@@ -231,7 +234,7 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
 
 
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
-           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
+           frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
            declared: bool, refined: int = 0) -> tuple[DepthSolution, np.ndarray]:
     """Return the depth of each pixel and its probability to be right; fill the coordinates.
     `declared`: whether the frames are what the manifest declares, as far as a sample has told. `refined`: how often the projector was."""
@@ -255,10 +258,10 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
         for name in maps:
             maps[name][band] = np.where(kept, to_numpy(getattr(found, name))[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
-    lagging: list[str] = []
+    widened: list[str] = []
     if declared:
-        lagging, wider = widen_lagging(planes, coordinates, (columns, rows), codes.collected, noise)
-        maps["sigma"] *= wider * widen_mixed(planes, coordinates, (columns, rows), codes.collected, noise)
+        widened, wider = _widen(planes, coordinates, codes, frames, noise)
+        maps["sigma"] *= wider
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
             missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
@@ -275,15 +278,24 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              projector_u=None if u is None else u.coordinate, projector_v=None if v is None else v.coordinate,
                              sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
                              amplitude=coordinates.amplitude, facts=facts)
-    solution.warnings += lagging
+    solution.warnings += widened
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
     found = None if u is None or v is None else contradicted(solution, u, v, capture.camera, projector, refined=refined > 0)
     if found is not None:
         if request.refine_projector and declared and refined < REFINEMENTS:
-            return _bands(planes, mask, codes, coordinates, found[0].projector, capture, noise, device, request, timings, declared=declared,
-                          refined=refined + 1)
+            return _bands(planes, mask, codes, coordinates, found[0].projector, capture, frames, noise, device, request, timings,
+                          declared=declared, refined=refined + 1)
         widen(solution, *found, check_projector(capture), refined=refined > 0)
     return solution, right
+
+
+def _widen(planes: Planes, coordinates: Coordinates, codes: PatternCodes, frames: list[Frame],
+           noise: NoiseModel) -> tuple[list[str], np.ndarray]:
+    """Add to the deviations of places what is no noise; return what is said of it, and the factor by which it widens the depth's."""
+    decoders = codes.columns, codes.rows
+    lagging, wider = widen_lagging(planes, coordinates, decoders, codes.collected, noise)
+    shifted, more = widen_shifted(planes, coordinates, decoders, codes.collected, frames)
+    return lagging + shifted, wider * more * widen_mixed(planes, coordinates, decoders, codes.collected, noise)
 
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,

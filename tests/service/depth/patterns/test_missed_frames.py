@@ -16,6 +16,9 @@ PLAIN = [*BLACK_WHITE, *gray_patterns("column", stripe=2, inverse=False)]
 WAVES = [*phase_patterns("column", 16.0, 3), *phase_patterns("column", 18.0, 3), *phase_patterns("column", 21.0, 3)]
 KARY = [*BLACK_WHITE, *({"code": "kary", "axis": "column", "base": 3, "digits": 4, "digit": digit, "stripe_px": 2, "levels": [0, 0.5, 1]}
                         for digit in reversed(range(4)))]
+BINARY = [{**pattern, "code": "binary"} for pattern in INVERSES]
+BINARY_PLAIN = [*BLACK_WHITE, *(pattern for pattern in BINARY if not pattern["inverse"])]
+XOR = [{**pattern, "code": "xor", "base_bit": 0} for pattern in INVERSES]
 NOISE = 0.003
 
 
@@ -50,16 +53,18 @@ def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
     assert f"{number:02d}.exr shows no stripes" in said[0] and not solved.any()
 
 
-@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (PLAIN, 5), (WAVES, 3), (KARY, 5)],
-                         ids=["wave", "bit", "inverse", "bit without inverse", "next wave", "digit"])
+@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (BINARY, 6), (PLAIN, 5), (WAVES, 3),
+                                                   (KARY, 5)],
+                         ids=["wave", "bit", "inverse", "bit of a binary code", "bit without inverse", "next wave", "digit"])
 def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, patterns, number):
     said, solved = measured(tmp_path, scene, patterns, again=[number])
     assert f"{number:02d}.exr and {number - 1:02d}.exr show the same" in said[0] and not solved.any()
 
 
-@pytest.mark.parametrize("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75)], ids=str)
-@pytest.mark.parametrize("patterns", [NUMBERED, INVERSES, PLAIN, WAVES, KARY, phase_patterns("column", 128.0)],
-                         ids=["numbered", "inverses", "without inverses", "waves", "digits", "one wave"])
+@pytest.mark.parametrize("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
+@pytest.mark.parametrize("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
+                         ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
+                              "one wave"])
 def test_bits_that_narrow_things_do_not_show_are_not_missed(tmp_path, scene, patterns, columns):
     said, solved = measured(tmp_path, scene, patterns, columns=columns)
     assert not said and solved.any()
