@@ -46,6 +46,10 @@ FAINT_PART = 0.25
 """Difference below which a bit may change at the place of a pixel, as a part of the contrast: finer bits of a carry are dimmer by blur."""
 FAINT_LIMITS = 2.0
 """The same in limits of doubt, where noise is larger."""
+CARRY_SIGMAS = DOUBT_SIGMAS * (FAINT_LIMITS + 1)
+"""Least difference of a bit that shows all light, in its standard deviations, with which a carry is read: below it noise makes bits faint
+that do not change, and all of them together are the carry in the middle of the projector. Without inverses a bit shows half of the light
+with three quarters of the variance."""
 FINE_BITS = 3
 """Number of the finest bits that tell direct light."""
 MUCH_STRAY = 0.5
@@ -278,7 +282,8 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
         for k in range(pack):
             carry = int(0)  # noqa: RUF046 - declares a variable that a branch may change
             if wp.static(plain):
-                carry = carry_of(doubt[k], open[k], faint[k])
+                clear = contrast[k] * contrast[k] >= wp.static(CARRY_SIGMAS**2 * (1.0 if inverses else 3.0)) * spread[k]
+                carry = wp.where(clear, carry_of(doubt[k], open[k], faint[k]), 0)
             edge = shown[k] - (shown[k] & carry) + ((carry + 1) >> 1)  # the stripe after it
             doubtful = (doubt[k] | open[k]) & ~carry
             left = int(0)  # noqa: RUF046 - declares a variable that a Warp loop may change

@@ -51,7 +51,7 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
                         & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2)))
     doubtful = doubtful | unproven
     carry = ((faint == (np.arange(n)[:, None] <= highest)).all(axis=0) & (highest >= 1) & uncertain & ~(doubtful & ~faint).any(axis=0)
-             & (code == "binary"))
+             & (code == "binary") & (contrast**2 >= (3 * doubt) ** 2 * variance * (1 if inverse is not None else 3)))
     free = min(free, {"binary": 0, "gray": n - 1, "xor": base_bit}[code])
     loose = np.minimum(np.maximum(doubt * np.sqrt(variance), stray) / np.maximum(contrast, 1e-20), 1)
     least, most, status = np.zeros(pixels, int), np.zeros(pixels, int), np.full(pixels, "OK", dtype=object)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import erf
 
 from kernels.device import to_numpy
 from kernels.errors import KernelError
@@ -33,6 +34,8 @@ SMOOTH_PART, SMOOTH_SIGMAS = 0.02, 4.0
 """Neighbours agree where their depths differ by less than this part, or this many deviations."""
 DOUBTFUL_SHARE = 0.5
 """Share of the pixels with signal that agree with a neighbour, below which other readings of the manifest are tried."""
+NOISY_PART = 0.75
+"""The same as a part of what the noise of the depths lets agree: ramps in weak light agree at a fifth of the pixels."""
 CLEAR_SHARE, CLEAR_TIMES = 0.4, 2.0
 """Another reading is named where it makes at least this share agree, and this many times as many as declared."""
 UNEVEN, LARGEST_STEP = 0.01, 0.05
@@ -133,9 +136,18 @@ READINGS = (
 )
 
 
-def agreeing_share(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
-                   device: str, *, mirrored: bool = False) -> float:
-    """Return the share of pixels with signal whose depth agrees with that of the next pixel of the row; NaN without enough signal."""
+class Agreement(NamedTuple):
+    """How many pixels with signal have a depth that agrees with that of the next pixel of the row."""
+
+    share: float
+    """Their part; NaN without enough signal."""
+    expected: float = 1.0
+    """The part that the noise of right depths would leave, by their deviations."""
+
+
+def agreement(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
+              device: str, *, mirrored: bool = False) -> Agreement:
+    """Return how far the depths of neighbours agree."""
     collected = collect(list(patterns))
     decoders = [choose_decoder(collected, axis, projector)[0] for axis in ("column", "row")]
     shape = sample.mask.shape
@@ -148,11 +160,14 @@ def agreeing_share(sample: Sample, patterns: list[Pattern], projector: PatternPr
     lit = sample.mask & ~np.isin(status, NOT_LIT)
     pairs = lit[:, 1:] & lit[:, :-1]
     if pairs.sum() < ENOUGH:
-        return float("nan")
+        return Agreement(float("nan"))
     known = (status == OK) & lit
-    step = np.abs(np.diff(depth, axis=1))
-    limit = np.maximum(SMOOTH_PART * depth[:, 1:], np.minimum(SMOOTH_SIGMAS * np.hypot(sigma[:, 1:], sigma[:, :-1]), 0.1 * depth[:, 1:]))
-    return float((known[:, 1:] & known[:, :-1] & (step <= limit)).sum() / pairs.sum())
+    known = known[:, 1:] & known[:, :-1]
+    step, deviation = np.abs(np.diff(depth, axis=1))[known], np.hypot(sigma[:, 1:], sigma[:, :-1])[known]
+    far = depth[:, 1:][known]
+    limit = np.maximum(SMOOTH_PART * far, np.minimum(SMOOTH_SIGMAS * deviation, 0.1 * far))
+    expected = erf(limit / np.maximum(np.sqrt(2) * deviation, 1e-12))
+    return Agreement(float((step <= limit).sum() / pairs.sum()), float(expected.mean()) if expected.size else 1.0)
 
 
 def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, device: str) -> Decoded:
@@ -180,11 +195,11 @@ def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], boo
 def check_declaration(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
                       device: str) -> str | None:
     """Return a sentence if the frames make much more sense when they are understood in another way than the manifest declares."""
-    share = agreeing_share(sample, patterns, projector, model, noise, device)
-    if not share < DOUBTFUL_SHARE:
+    share, expected = agreement(sample, patterns, projector, model, noise, device)
+    if not share < min(DOUBTFUL_SHARE, NOISY_PART * expected):
         return None
-    readings = _other_readings(patterns, lambda other, mirrored: agreeing_share(sample, other, projector, model, noise, device,
-                                                                                mirrored=mirrored))
+    readings = _other_readings(patterns, lambda other, mirrored: agreement(sample, other, projector, model, noise, device,
+                                                                           mirrored=mirrored).share)
     best, chosen = max(readings, key=lambda found: found[0], default=(0.0, None))
     if chosen is None or best < max(CLEAR_SHARE, CLEAR_TIMES * share):
         return None

@@ -43,11 +43,12 @@ FITTING = 0.55
 less where edges are taken for others."""
 ROUNDS = 20
 """Number of rounds in which edges at borders of surfaces lose their weight."""
-CLEAR_SIGMAS, CLEAR_PX = 5.0, 0.05
-"""By how much the frames must differ, in standard deviations and in camera pixels, so that it is neither noise nor a lens, whichever of
-them is left out: the finest alone is shifted by light below surfaces, the coarsest by what moves near its edge."""
-OWN_PX = 0.01
-"""Deviation in camera pixels of a frame beside that of noise."""
+CLEAR_SIGMAS, OTHERS_SIGMAS, CLEAR_PX = 5.0, 3.0, 0.05
+"""By how much the frames must differ in standard deviations, all of them and whichever of them is left out, and in camera pixels then: the
+finest alone is shifted by light below surfaces, the coarsest by what moves near its edge."""
+EDGE_PX = 0.05
+"""Deviation in camera pixels of one edge of the projector on all lines: where it lies between the pixels moves where it seems to be, and on
+a surface that faces the camera it lies alike on every line."""
 OVER = 15
 """Side in pixels of the square over which the step of places from pixel to pixel is averaged."""
 
@@ -63,13 +64,13 @@ class FrameShifts(NamedTuple):
     def clear(self) -> bool:
         """Return whether images have shifted."""
         others = ~np.eye(len(self.shift), dtype=bool)
-        weight = 1 / (self.deviation**2 + OWN_PX**2)
-        return all(self._differ(self.shift[kept], weight[kept]) for kept in others)
+        return self._away(slice(None)) > CLEAR_SIGMAS and all(
+            np.ptp(self.shift[kept]) > CLEAR_PX and self._away(kept) > OTHERS_SIGMAS for kept in others)
 
-    @staticmethod
-    def _differ(shift: np.ndarray, weight: np.ndarray) -> bool:
-        away = shift - np.average(shift, weights=weight)
-        return bool(np.ptp(shift) > CLEAR_PX and (weight * away**2).sum() > CLEAR_SIGMAS**2)
+    def _away(self, kept: np.ndarray | slice) -> float:
+        """Return by how many standard deviations some of the shifts differ from their mean, all together."""
+        shift, weight = self.shift[kept], 1 / self.deviation[kept] ** 2
+        return float(np.sqrt((weight * (shift - np.average(shift, weights=weight)) ** 2).sum()))
 
     def over(self, frames: int) -> float:
         """Return by how much an image of a sequence of so many frames may lie aside of the first, as a standard deviation in pixels: by
@@ -255,4 +256,6 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     if weight.mean() < FITTING:
         return None
     deviation = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ (weight[:, None] * design))))[:-1]
+    places = [max(len(np.unique(at[1:-1][even & (here[1:-1] == each)])), 1) for each in np.flatnonzero(told)]
+    deviation = np.hypot(deviation, EDGE_PX / np.sqrt(places))
     return FrameShifts(shift[:-1] - shift[:-1].mean(), deviation, time[told])

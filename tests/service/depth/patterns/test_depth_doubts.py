@@ -12,6 +12,7 @@ from stage.patterns.base import uniform_patterns
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
+from stage.patterns.ramp import ramp_patterns
 from stage.results.depth_maps import DepthMaps
 
 RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)
@@ -133,6 +134,15 @@ def test_most_pixels_refused_is_said(relit, tmp_path, light):
     maps, report, _ = solve(relit, tmp_path)
     assert "lit pixels have a depth that can be trusted; most of the" in report["warnings"][0]
     assert maps.confidence[maps.mask].max() < 0.2
+
+
+def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):
+    """Noise of weak light makes neighbours differ by as much as their deviations say: a fifth agree, and half if the images are one
+    frame early."""
+    noisy = World(shapes=ROOM.shapes, rig=RIG, read_noise=0.012, electrons=2000.0)
+    write_capture(tmp_path, noisy, ramp_patterns("column"), light=light)
+    _, report, out = solve(relit, tmp_path, "--read-noise", 0.012, "--photon-gain", 1 / 2000)
+    assert "as declared" not in out and report["pixels"]["ok"] > 0
 
 
 @pytest.mark.long
