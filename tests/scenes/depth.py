@@ -130,9 +130,10 @@ def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *
 
 
 def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, width: float, noise: float = 0.0, ambient: bool = True,
-                 undeclared: list[dict[str, Any] | None] | None = None, strength: float = 1.0, **changes: Any) -> Path:
+                 undeclared: list[dict[str, Any] | None] | None = None, strength: float = 1.0, levels: int | None = None,
+                 **changes: Any) -> Path:
     """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray; `undeclared` are second planes of the
-    frames that the manifest does not name."""
+    frames that the manifest does not name; `levels`: steps between black and white, None for floats."""
     rng = np.random.default_rng(3)
     frames = []
     points = scene.points
@@ -151,6 +152,7 @@ def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, wi
             glow = glow + strength * np.exp(-(((points - other["point_m"]) @ normal) ** 2) / (2 * width**2))
         image = AMBIENT * scene.albedo + 0.5 * glow[..., None] * scene.albedo[:, :, :1] * (1.0, 0.05, 0.02)
         image = np.maximum(image + rng.normal(0, noise, image.shape), 0) if noise else image
+        image = np.round(image * levels) / levels if levels is not None else image
         write_exr(folder / f"{number:03d}.exr", image)
         frames.append({"image": f"{number:03d}.exr", **({"laser": laser} if laser is not None else {"light": {"type": "off"}})})
     write_manifest(folder, manifest(frames, None, **changes))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
-from kernels.spread import MAD_TO_SIGMA
 from kernels.status import Status
+from service.depth.laser.background import background
 
 LEVEL = 0.15
 """Part of the peak above which a pixel counts towards the first centre and the width."""
@@ -66,8 +66,7 @@ def find_spot(signal: np.ndarray) -> Spot:
         return none
     values = np.where(valid, signal, 0)
     sample = values[valid][:: max(1, valid.sum() // 100_000)]
-    middle = float(np.median(sample))
-    noise = max(MAD_TO_SIGMA * float(np.median(np.abs(sample - middle))), 1e-7 * float(np.abs(values).max()))
+    middle, noise = background(sample, 1e-7 * float(np.abs(values).max()))
     values = np.where(valid, signal - middle, 0)
     row, col = (int(at) for at in np.unravel_index(int(np.argmax(_blurred(values))), values.shape))
     if values[row, col] <= 0 or _blurred(values[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]).max() < NOISE_FACTOR * noise / 3:

@@ -19,11 +19,11 @@ import numpy as np
 from kernels.device import to_numpy
 from kernels.status import Status
 from kernels.structured.stripe import REACH, find_stripe, plane_depths
+from service.depth.laser.background import background
 from service.depth.laser.stripe_curves import PEAKS, Chosen, choose_curves
 from service.depth.laser.stripe_map import StripeMap, StripeSamples
 from stage.capture.camera import Camera
 from stage.capture.light import LaserPlane
-from stage.spread import MAD_TO_SIGMA
 
 ENOUGH = 30
 """Number of pixels under both sweeps from which on these are compared."""
@@ -143,8 +143,7 @@ def stripe_signal(radiance: np.ndarray, mask: np.ndarray) -> Signal:
     channel = int(np.argmax(np.where(mask[..., None], radiance, 0).max(axis=(0, 1))))
     inside = radiance[..., channel][mask]
     few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
-    middle = float(np.median(few))
-    noise = max(MAD_TO_SIGMA * float(np.median(np.abs(few - middle))), 1e-6 * float(inside.max()), 1e-12)
+    middle, noise = background(few, max(1e-6 * float(inside.max()), 1e-12))
     return Signal(np.where(mask, radiance[..., channel] - middle, 0), channel, noise)
 
 

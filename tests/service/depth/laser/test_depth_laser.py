@@ -211,6 +211,15 @@ def test_a_faint_reflection_takes_nothing_out(relit, tmp_path):
     assert np.quantile(np.abs(maps.depth - scene.depth)[maps.mask], 0.99) < 1e-3
 
 
+@pytest.mark.parametrize("levels", [255, 100])
+def test_steps_of_a_file_are_no_light_of_the_laser(relit, tmp_path, levels):
+    """A camera quieter than a step of its files, and planes that pass beside the picture: single readings a step off are no stripes."""
+    write_lasers(tmp_path, SCENE, [plane(x) for x in np.linspace(-0.3, 0.3, 13)], width=1.5e-3, noise=0.001, levels=levels, camera=CAMERA)
+    _, points, report = solve(relit, tmp_path)
+    assert not any("second" in warning for warning in report["warnings"])
+    assert len(points) == 5 * CAMERA.height and np.median(off_surface(points)) < 0.5e-3
+
+
 def test_spots_and_stripes_together(relit, tmp_path):
     write_lasers(tmp_path, SCENE, [plane(-0.03), ray((0.05, 0.0, -1.3))], width=1.5e-3, camera=CAMERA)
     _, points, report = solve(relit, tmp_path)
