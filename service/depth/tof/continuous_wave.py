@@ -20,7 +20,7 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
-from service.depth.tof.phase_checks import DOUBTED, Phases, misread_direction, misread_frequencies
+from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, misread_direction, misread_frequencies
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -202,10 +202,13 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     size_rad = np.inf
     wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing) if lit.any() else None
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
+    repeat_m = common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
+    range_m = to_numpy(ranges.range)[:pixels].reshape(rows, cols)
     if wrong is None:
-        wrong = misread_direction(to_numpy(ranges.range)[:pixels].reshape(rows, cols),
-                                  to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols), sure, nearest_m=nearest,
-                                  repeat_m=common_range_m(frames.modulation_hz, SPEED_OF_LIGHT))
+        amplitude = to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols)
+        wrong = misread_direction(range_m, amplitude, sure, nearest_m=nearest, repeat_m=repeat_m)
+    if wrong is None:
+        wrong = beyond_span(range_m, sure, nearest_m=nearest, repeat_m=repeat_m)
     if wrong is None:
         size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
     if wrong is not None and size_rad > SCATTERED_RAD:
@@ -214,7 +217,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         "modulation_hz": found.modulation_hz.tolist(),
         "images": len(frames.images),
         "span_m": [nearest, round(farthest, 4)],
-        "common_range_m": round(common_range_m(frames.modulation_hz, SPEED_OF_LIGHT), 4),
+        "common_range_m": round(repeat_m, 4),
         "vote": options.vote,
         "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
         "wiggling": straight,

@@ -40,6 +40,9 @@ SURE_BLOCK, MOST_BLOCKS, LAWFUL_BLOCKS, FEWEST_BLOCKS = 0.3, 0.7, 0.6, 20
 """Least correlation of brightness and range in a block that tells a sign, share of such blocks in which surfaces grow brighter with the
 distance and share of these in which the brightness falls as light does if phases run backwards, from which on they do, and number of blocks
 that tell it. Bowls and hollows with bright paint have 0.45 of lawful blocks at most, rooms 0.74 at least."""
+END_PART, FEWEST_WRAPPED, WRAPPED_SHARE = 0.03, 20, 1e-4
+"""Largest distance of neighbours over an end of the span, as a part of it, and number of such neighbours and their share of the pixels,
+from which on a surface runs on behind the span."""
 DOUBTED = 0.1
 """Factor on the probability of ranges whose frames are declared wrongly."""
 
@@ -167,3 +170,23 @@ def misread_direction(range_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarr
         return None
     return (f"frames[].tof.reference_phase_rad: in {100 * share:.0f} % of the scene surfaces grow brighter with the distance, as if the "
             "phases ran backwards: check the order of the images, and the sign of reference_phase_rad; no range is believed")
+
+
+def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float) -> str | None:
+    """Return that surfaces run on behind the farthest range and so appear before the nearest, as a sentence; None if none does.
+
+    Args:
+        range_m: [rows, cols] metres, searched over all of the span.
+        sure: [rows, cols] bool, pixels with a range.
+        nearest_m, repeat_m: the least range, and the distance after which all phases repeat.
+    """
+    part = (range_m - nearest_m) / repeat_m
+    wrapped = 0
+    for axis in (0, 1):
+        step = np.abs(np.diff(part, axis=axis))
+        both = sure[1:] & sure[:-1] if axis == 0 else sure[:, 1:] & sure[:, :-1]
+        wrapped += int((both & (np.abs(1 - step) < END_PART)).sum())
+    if wrapped < max(FEWEST_WRAPPED, WRAPPED_SHARE * sure.sum()):
+        return None
+    return (f"frames[].tof.modulation_hz: surfaces run on from {nearest_m + repeat_m:.2f} m to {nearest_m:.2f} m, where all phases repeat: "
+            "they are farther than the frequencies tell apart; give --near-m, or add a frequency; no range is believed")

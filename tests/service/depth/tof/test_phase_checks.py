@@ -106,3 +106,16 @@ def test_what_is_declared_rightly_is_believed(tmp_path, more):
     result = measured(tmp_path, images, settings)
     assert result.maps.mask.mean() > 0.95
     assert not any("believed" in sentence for sentence in result.warnings)
+
+
+@pytest.mark.parametrize(("hz", "phases"), [((60e6,), 4), ((60e6, 90e6), 3)], ids=["one frequency", "two"])
+def test_surfaces_behind_the_span_are_named(tmp_path, hz, phases):
+    """A floor that runs from 2 to 6 m: the phases repeat after 2.5 and 5 m. From 2 m on the second pair tells its ranges apart."""
+    range_m = np.linspace(6, 2, ROWS)[:, None] + np.zeros((ROWS, COLS))
+    settings = tof.even(hz, phases)
+    images = tof.correlations(tof.View(range_m, np.full(range_m.shape, 0.5), np.ones(range_m.shape)), 2e5, settings, ambient=30, seed=3)
+    found = measured(tmp_path, images, settings)
+    assert not found.maps.mask.any() and "run on from" in found.warnings[0]
+    if len(hz) > 1:
+        found = depth(DepthRequest(capture=tmp_path, out=tmp_path / "near", device="cpu", near_m=1.5))
+        assert found.maps.mask.mean() > 0.9 and np.abs(found.maps.range - range_m)[found.maps.mask].max() < 0.1
