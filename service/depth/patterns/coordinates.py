@@ -38,6 +38,13 @@ class AxisMaps(NamedTuple):
         """Return where the decoder is sure, [rows, cols] bool."""
         return np.isin(self.status, SOLVED)
 
+    def widen(self, off: np.ndarray) -> np.ndarray:
+        """Add what is no noise, `off` [rows, cols] projector pixels, to the deviations; return by which factor they grow, [rows, cols]."""
+        sigma = np.where(self.sigma > 0, np.hypot(self.sigma, off), 0)
+        grown = np.maximum(sigma / np.maximum(self.sigma, 1e-12), 1)
+        self.sigma[:] = sigma
+        return grown
+
 
 @dataclass
 class Coordinates:

@@ -121,9 +121,7 @@ def widen_lagging(planes: Planes, coordinates: Coordinates, decoders: Sequence[A
         found = None if decoder is None or axis is None else find_lag(planes, axis, decoder, collected, noise)
         if found is not None:
             assert axis is not None and decoder is not None
-            sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, found.sigma), 0)
-            wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
-            axis.sigma[:] = sigma
+            wider = np.maximum(wider, axis.widen(found.sigma))
             said += found.sentences(decoder.axis)
     return said, wider
 

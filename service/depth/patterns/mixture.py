@@ -39,10 +39,7 @@ def widen_mixed(planes: Planes, coordinates: Coordinates, decoders: Sequence[Axi
         if part is None or axis is None or decoder is None:
             continue
         period = min(next(code for code in decoder.used if isinstance(code, PhaseCode)).periods_px)
-        off = TURN * part / (1 - part) * period / (2 * np.pi)
-        sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, off), 0)
-        wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
-        axis.sigma[:] = sigma
+        wider = np.maximum(wider, axis.widen(TURN * part / (1 - part) * period / (2 * np.pi)))
     return wider
 
 

@@ -75,7 +75,7 @@ class FrameShifts(NamedTuple):
     def over(self, frames: int) -> float:
         """Return by how much an image of a sequence of so many frames may lie aside of the first, as a standard deviation in pixels: by
         the whole drift, and by what is no drift."""
-        drift = np.polyfit(self.time, self.shift, 1)
+        drift = np.polyfit(self.time, self.shift, 1, w=1 / self.deviation)
         rest = self.shift - np.polyval(drift, self.time)
         return float(np.hypot(drift[0] * (frames - 1), np.sqrt((rest**2).sum() / max(len(rest) - 2, 1))))
 
@@ -92,10 +92,7 @@ def widen_shifted(planes: Planes, coordinates: Coordinates, decoders: Sequence[A
         found = find_shifts(planes, axis, decoder, collected, frames, across)
         if found is not None and found.clear:
             coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
-            off = found.over(len(frames)) * _slope(axis, across)
-            sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, off), 0)
-            wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
-            axis.sigma[:] = sigma
+            wider = np.maximum(wider, axis.widen(found.over(len(frames)) * _slope(axis, across)))
     if not coordinates.shift_px:
         return [], wider
     return [f"frames[]: the stripes of different frames lie up to {coordinates.shift_px:.2g} camera pixels aside of each other, as where "
@@ -244,9 +241,10 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     design[:, -1] = part * (1 - part) * (long / FARTHEST) ** 2  # a surface that bends
     aside = pixel[1:-1][even] - (1 - part) * pixel[:-2][even] - part * pixel[2:][even]
     told = np.abs(design[:, :-1]).sum(axis=0) >= ENOUGH
-    if told.sum() < 2:
+    whole = ~design[:, :-1][:, ~told].any(axis=1)
+    if told.sum() < 2 or not whole.any():
         return None
-    design = design[:, [*np.flatnonzero(told), len(time)]]
+    design, aside = design[whole][:, [*np.flatnonzero(told), len(time)]], aside[whole]
     weight, spread, shift = np.ones(len(aside)), LEAST_SPREAD, np.zeros(design.shape[1])
     for _ in range(ROUNDS):
         shift = np.linalg.lstsq(np.sqrt(weight)[:, None] * design, np.sqrt(weight) * aside, rcond=None)[0]

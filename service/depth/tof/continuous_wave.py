@@ -20,7 +20,7 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
-from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, misread_direction, misread_frequencies
+from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, misread_direction, misread_frequencies, unfitting_images
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -200,7 +200,9 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
 
     phase, spread = (to_numpy(array)[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
     size_rad = np.inf
-    wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing) if lit.any() else None
+    wrong = unfitting_images(frames.images, frames.modulation_hz, frames.reference_phase_rad, frames.scale, usable)
+    if wrong is None and lit.any():
+        wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing)
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
     repeat_m = common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
     range_m = to_numpy(ranges.range)[:pixels].reshape(rows, cols)

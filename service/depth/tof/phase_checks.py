@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.tof.continuous.continuous import LEAST_PHASES, weights
+
 LAG = 3
 """Distance in pixels of the neighbours that are compared: a surface changes over it by more than noise."""
 LARGEST_RAD = 0.7
@@ -40,6 +42,9 @@ SURE_BLOCK, MOST_BLOCKS, LAWFUL_BLOCKS, FEWEST_BLOCKS = 0.3, 0.7, 0.6, 20
 """Least correlation of brightness and range in a block that tells a sign, share of such blocks in which surfaces grow brighter with the
 distance and share of these in which the brightness falls as light does if phases run backwards, from which on they do, and number of blocks
 that tell it. Bowls and hollows with bright paint have 0.45 of lawful blocks at most, rooms 0.74 at least."""
+UNFIT_TIMES, UNFIT_PART = 4.0, 0.2
+"""Variance that the wave of a frequency leaves of its images, over that of their neighbours in a row, and its root over the amplitude, from
+which on an image is not that of its phase."""
 END_PART, FEWEST_WRAPPED, WRAPPED_SHARE = 0.03, 20, 1e-4
 """Largest distance of neighbours over an end of the span, as a part of it, and number of such neighbours and their share of the pixels,
 from which on a surface runs on behind the span."""
@@ -170,6 +175,37 @@ def misread_direction(range_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarr
         return None
     return (f"frames[].tof.reference_phase_rad: in {100 * share:.0f} % of the scene surfaces grow brighter with the distance, as if the "
             "phases ran backwards: check the order of the images, and the sign of reference_phase_rad; no range is believed")
+
+
+def unfitting_images(images: np.ndarray, hz: np.ndarray, reference_phase_rad: np.ndarray, scale: np.ndarray,
+                     usable: np.ndarray) -> str | None:
+    """Return that images of a frequency are no wave over their phases, as a sentence: one is dark, shown twice or another's; None where all
+    are, or where a frequency has three images, which any wave fits.
+
+    Args:
+        images: [images, rows · cols] recorded values.
+        hz, reference_phase_rad, scale: [images], as `kernels.tof.continuous.continuous.weights` takes them.
+        usable: [rows, cols] bool.
+    """
+    rows, frequencies, index = weights(hz, reference_phase_rad, scale)
+    triples = usable[:, 2:] & usable[:, 1:-1] & usable[:, :-2]
+    if not triples.any():
+        return None
+    for number, frequency in enumerate(frequencies):
+        own = index == number
+        if own.sum() <= LEAST_PHASES:
+            continue
+        mine = images[own].astype(np.float64) * scale[own, None]
+        fit = rows[own].T @ images[own]
+        delta = reference_phase_rad[own, None]
+        left = ((mine - fit[0] - fit[1] * np.cos(delta) - fit[2] * np.sin(delta)) ** 2).sum(axis=0) / (own.sum() - LEAST_PHASES)
+        grid = mine.reshape(-1, *usable.shape)
+        bend = (grid[..., 2:] - 2 * grid[..., 1:-1] + grid[..., :-2])[:, triples]
+        unfit, noise = np.median(left[usable.ravel()]), np.median(bend**2) / 6
+        if unfit > UNFIT_TIMES * noise and unfit > UNFIT_PART**2 * np.median((fit[1] ** 2 + fit[2] ** 2)[usable.ravel()]):
+            return (f"frames[].tof: the images of {frequency / 1e6:g} MHz are no wave over their phases: one of them may be dark, shown "
+                    "twice or exchanged; check image and reference_phase_rad; no range is believed")
+    return None
 
 
 def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float) -> str | None:

@@ -119,3 +119,15 @@ def test_surfaces_behind_the_span_are_named(tmp_path, hz, phases):
     if len(hz) > 1:
         found = depth(DepthRequest(capture=tmp_path, out=tmp_path / "near", device="cpu", near_m=1.5))
         assert found.maps.mask.mean() > 0.9 and np.abs(found.maps.range - range_m)[found.maps.mask].max() < 0.1
+
+
+@pytest.mark.parametrize("fault", ["dark", "shown twice", "exchanged"])
+def test_an_image_that_is_not_that_of_its_phase_is_named(tmp_path, fault):
+    """Two frequencies of four images: what the wave leaves is many times what neighbours in a row differ by."""
+    images, settings = under((40e6, 70e6))
+    if fault == "exchanged":
+        images[[0, 1]] = images[[1, 0]]
+    else:
+        images[5] = 0 if fault == "dark" else images[4]
+    found = measured(tmp_path, images, settings)
+    assert not found.maps.mask.any() and f"images of {40 if fault == 'exchanged' else 70} MHz are no wave" in found.warnings[0]
