@@ -60,6 +60,7 @@ CASES = (
     Case("cw, two frequencies exchanged", in_model=False, hz=(40e6, 70e6), misread=lambda entry: entry | {
         "modulation_hz": 110e6 - entry["modulation_hz"]}),
     Case("cw, fog of 0.05 / m", in_model=False, fog=0.05),
+    Case("cw, 30 MHz alone, which tell 5 m apart", in_model=False, hz=(30e6,)),
 )
 
 

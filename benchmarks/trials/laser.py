@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import shift
 
 from benchmarks.trials.trial import Trial
 from service.depth.depth import depth
@@ -48,6 +49,8 @@ class Case:
     turned_rad: float = 0.0
     """Angle by which they are turned."""
     accuracy_deg: float | None = None
+    drift_px: float = 0.0
+    """By how much the camera drifts during the sweep."""
 
 
 def grey(points: np.ndarray) -> np.ndarray:
@@ -88,6 +91,8 @@ CASES = (
     Case("planes declared in reverse order", cloth, planes=60, in_model=False, backwards=True),
     Case("planes declared 1° aside", grain, planes=60, in_model=False, turned_rad=float(np.radians(1))),
     Case("planes declared 1° aside, accuracy_deg 1", grain, planes=60, turned_rad=float(np.radians(1)), accuracy_deg=1.0),
+    Case("the camera drifts by 2 px on cloth", cloth, planes=60, in_model=False, drift_px=2.0),
+    Case("the camera drifts by 2 px on grain", grain, planes=60, in_model=False, drift_px=2.0),
     Case("a second plane of a half on grain", grain, planes=40, in_model=False, second=0.5, second_rad=0.03),
 )
 
@@ -147,7 +152,10 @@ def swept(case: Case, seed: int = 5) -> Trial:
                 if angle is not None and strength > 0:
                     off = (away @ plane_normal(angle + turn)) / distance / BEAM_RAD
                     image = image + 0.6 * strength * albedo * cosine * np.exp(-0.5 * off**2)
-            pixel = image.reshape(ROWS, DOWN, COLS, ACROSS).mean(axis=(1, 3)) + random.normal(0, NOISE, (ROWS, COLS))
+            pixel = image.reshape(ROWS, DOWN, COLS, ACROSS).mean(axis=(1, 3))
+            if case.drift_px:
+                pixel = shift(pixel, (0, case.drift_px * index / case.planes), order=1, mode="nearest")
+            pixel = pixel + random.normal(0, NOISE, (ROWS, COLS))
             values = np.maximum(pixel + 0.05, 0).astype(np.float32)  # 0.05: a pedestal, so that noise is not cut
             exr.write(folder / f"{index:03d}.exr", dict.fromkeys("RGB", values), color_space="lin_rec709_scene", metadata={})
             light = {"light": {"type": "off"}}

@@ -44,6 +44,7 @@ CODES: dict[str, Sequence[Pattern]] = {
     "Gray, white and black": binary_patterns(WIDTH, "column", inverses=False),
     "Gray, both axes": (*binary_patterns(WIDTH, "column"), *binary_patterns(HEIGHT, "row", references=False)),
     "binary": binary_patterns(WIDTH, "column", code="binary"),
+    "binary, white and black": binary_patterns(WIDTH, "column", code="binary", inverses=False),
     "XOR": xor_patterns(WIDTH, "column"),
     "k-ary, reflected": kary_patterns(WIDTH, "column", base=3),
     "k-ary, plain": kary_patterns(WIDTH, "column", base=3, reflected=False),
@@ -75,7 +76,8 @@ def trials(data: Path | None) -> Iterator[Trial]:
     light = trace(World(shapes=SHELF))
     for words, (read, electrons) in NOISES.items():
         world = World(shapes=SHELF, read_noise=read, electrons=electrons)
-        for name in CODES if not words else ("Gray, inverses", "k-ary, plain", "phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
+        for name in CODES if not words else ("Gray, inverses", "binary, white and black", "k-ary, plain", "ramps",
+                                                    "phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
             yield _run(f"{name}{words}", True, world, CODES[name], light)
     response = (np.linspace(0, 1, 256)**GAMMA).tolist()
     for name, patterns in BENT.items():

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import shift
 
 from tests.reference import projector as reference
 from tests.scenes.captures import write_exr, write_image, write_manifest
@@ -131,9 +132,10 @@ def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *
 
 def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, width: float, noise: float = 0.0, ambient: bool = True,
                  undeclared: list[dict[str, Any] | None] | None = None, strength: float = 1.0, levels: int | None = None,
-                 **changes: Any) -> Path:
+                 aside: np.ndarray | None = None, **changes: Any) -> Path:
     """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray; `undeclared` are second planes of the
-    frames that the manifest does not name; `levels`: steps between black and white, None for floats."""
+    frames that the manifest does not name; `levels`: steps between black and white, None for floats; `aside`:
+    by how many pixels each laser frame lies farther right, None: not at all."""
     rng = np.random.default_rng(3)
     frames = []
     points = scene.points
@@ -151,6 +153,8 @@ def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, wi
             normal = np.array(other["normal"]) / np.linalg.norm(other["normal"])
             glow = glow + strength * np.exp(-(((points - other["point_m"]) @ normal) ** 2) / (2 * width**2))
         image = AMBIENT * scene.albedo + 0.5 * glow[..., None] * scene.albedo[:, :, :1] * (1.0, 0.05, 0.02)
+        if aside is not None and laser is not None:
+            image = shift(image, (0, aside[number], 0), order=1, mode="nearest")
         image = np.maximum(image + rng.normal(0, noise, image.shape), 0) if noise else image
         image = np.round(image * levels) / levels if levels is not None else image
         write_exr(folder / f"{number:03d}.exr", image)

@@ -12,6 +12,7 @@ from kernels.status import Status
 from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.laser.spot import find_spot, nearest_points
+from service.depth.laser.steady import Moves, widen_moved
 from service.depth.laser.stripe_curves import WHOLE
 from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
 from service.depth.laser.stripes import CLEAR_SIGMAS, Sweep, along_of, compare_sweeps, measure_stripe, stripe_signal, unconfirmed
@@ -66,6 +67,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     spots: list[_Spot] = []
     seen: Counter[str] = Counter()
     brightest = np.zeros(shape, np.float32)
+    moves = Moves(background if correction.ambient is None else correction.ambient, mask)
     timings.stage("laser", len(frames))
     for number, frame in enumerate(frames):
         radiance = correction.apply(frame).pixels - background
@@ -78,6 +80,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
                 spots.append(spot)
         elif isinstance(frame.laser, LaserPlane):
             along = along_of(frame.laser)
+            moves.add(radiance, signal)
             found = measure_stripe(signal, mask, frame.laser, sweeps[along], camera, device=device, near_m=near_m, far_m=far_m)
             samples[along].append(found.samples)
             curves[along].append(np.where(found.curve >= 0, found.curve + number * CURVES_OF_A_FRAME, -1))
@@ -85,6 +88,12 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
             if found.doubled > DOUBLED * lines or found.second > WHOLE * lines:
                 doubled.append(frame.image)
         timings.advance(number + 1)
+    moved = moves.clear()
+    if moved is not None:
+        stripes = [along_of(frame.laser) for frame in frames if isinstance(frame.laser, LaserPlane)]
+        for along in samples:
+            own = moved[np.array(stripes) == along]
+            samples[along] = widen_moved(samples[along], _planes(capture, along), own, camera, along=along)
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
     one_sweep = [sentence for along in kept if (sentence := unconfirmed(samples[along], _planes(capture, along), camera, along=along))]
     for along, part in kept.items():
@@ -107,6 +116,12 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     solution = _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
     if "sweeps_differ_m" not in solution.facts and any(plane.accuracy_deg is None for along in kept for plane in _planes(capture, along)):
         solution.warnings += one_sweep[:1]
+    if moved is not None:
+        size = float(np.hypot(*moved.T).max())
+        solution.facts["image_shift_px"] = float(f"{size:.3g}")
+        solution.warnings.append(f"frames[].laser: what the camera sees under ambient light moves by up to {size:.2g} px between the "
+                                 "frames, as where the camera or the scene has moved during the sweep: the standard deviations hold about "
+                                 "what that makes; keep both still")
     if doubled:
         solution.warnings.append(_second_stripes(doubled, len(frames)))
     return solution
