@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -79,17 +80,13 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
 
 def read_stripes(sample: Sample, code: BinaryCode, collected: Collected, noise: NoiseModel) -> Stripes | None:
     """Return the bits of a code; None without the frames that tell them, or if too few pixels read them."""
-    grey = sample.grey
-    frames = grey[list(code.frames)]
-    if code.inverses is not None:
-        others = grey[list(code.inverses)]
-    elif collected.white is not None and collected.black is not None:
-        others = np.broadcast_to(grey[collected.white] + grey[collected.black] - frames, frames.shape)
-    else:
+    if code.lacks(collected.white, collected.black) is not None:
         return None
-    contrast = frames - others
+    grey = sample.grey
+    contrast = contrasts(grey, code, collected)
+    both = 2 * grey[list(code.frames)] - contrast  # light of a bit and its inverse
     largest = np.abs(contrast).max(axis=0)
-    deviation = np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(frames + others, 0))
+    deviation = np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(both, 0))
     lit = sample.mask.ravel() & (largest > CLEAR_SIGMAS / CLEAR_BIT * deviation.max(axis=0))
     if sample.saturated is not None:
         lit &= ~sample.saturated.any(axis=0)

@@ -16,6 +16,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
+from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Code, Collected
@@ -173,7 +174,7 @@ def _measure_of(used: Sequence[Code], collected: Collected, noise: NoiseModel) -
         return _Measure(lambda grey, place: _wave_sums(grey, place, phase, noise), lambda means, count: _wave_lag(means, count, phase),
                         between_waves=True)
     stripes = next((code for code in used if isinstance(code, BinaryCode) and code.name != "xor"), None)
-    if stripes is None or (stripes.inverses is None and (collected.white is None or collected.black is None)):
+    if stripes is None or stripes.lacks(collected.white, collected.black) is not None:
         return None
     return _Measure(lambda grey, place: _edge_sums(grey, place, stripes, phase, collected),
                     lambda means, count: _edge_lag(means, count, stripes, phase), between_waves=False)
@@ -233,11 +234,7 @@ def _edge_sums(grey: np.ndarray, place: np.ndarray, code: BinaryCode, phase: Pha
 
     Of edges those of stripes as wide as a period count: finer ones shift as the wave does.
     """
-    frames = grey[list(code.frames)]
-    if code.inverses is not None:
-        contrast = frames - grey[list(code.inverses)]
-    else:
-        contrast = 2 * frames - grey[collected.white] - grey[collected.black]
+    contrast = contrasts(grey, code, collected)
     edge = np.maximum(np.rint(place / code.stripe_px).astype(np.int64), 1)
     away = place - edge * code.stripe_px
     before, after = ((number if code.name == "binary" else number ^ (number >> 1)) for number in (edge - 1, edge))

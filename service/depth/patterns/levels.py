@@ -19,6 +19,7 @@ from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import ENOUGH, LIT_SIGMAS, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
+from stage.patterns.kary import KaryCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 
 CLEAR_SIGMAS = 5.0
@@ -115,6 +116,15 @@ def between(grey: np.ndarray, collected: Collected, noise: NoiseModel) -> np.nda
             parts = (np.stack([*bits[-ceil(COARSE * len(bits)):], *even]) - dark) / np.maximum(bright - dark, 1e-12)
             found |= lit & (((parts > BETWEEN[0]) & (parts < BETWEEN[1])).sum(axis=0) >= SEVERAL)
     return found
+
+
+def contrasts(grey: np.ndarray, code: BinaryCode | KaryCode, collected: Collected) -> np.ndarray:
+    """Return by how much each bit is brighter than its inverse or, twice, each bit or digit than the mean of white and black, [bits, …], of
+    readings [frames, …] of a code that does not lack these frames."""
+    frames = grey[list(code.frames)]
+    if isinstance(code, BinaryCode) and code.inverses is not None:
+        return np.asarray(frames - grey[list(code.inverses)])
+    return np.asarray(2 * frames - grey[collected.white] - grey[collected.black])
 
 
 def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
+from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -50,8 +51,7 @@ def _mixed_part(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
     if phase is None or stripes is None or len(set(phase.periods_px)) > 1:
         return None
     coarse = [bit for bit in range(len(stripes.frames)) if 2 * stripes.stripe_px * 2**bit >= phase.periods_px[0]]
-    references = collected.white is not None and collected.black is not None
-    if len(coarse) < LEAST_BITS or (stripes.inverses is None and not references) or not axis.solved.any():
+    if len(coarse) < LEAST_BITS or stripes.lacks(collected.white, collected.black) is not None or not axis.solved.any():
         return None
     second, deviation = np.zeros_like(axis.coordinate), np.zeros_like(axis.coordinate)
     for band in planes.bands(BYTES_PER_PIXEL):
@@ -67,13 +67,8 @@ def _second_bit(grey: np.ndarray, stripes: BinaryCode, coarse: Sequence[int], co
     """Return the second-smallest difference of coarse bits over the contrast, and its standard deviation, [pixels], of readings
     [frames, pixels]."""
     bits = grey[[stripes.frames[bit] for bit in coarse]]
-    if stripes.inverses is not None:
-        away = np.abs(bits - grey[[stripes.inverses[bit] for bit in coarse]])
-        contrast, times = away.max(axis=0), 2.0
-    else:
-        assert collected.white is not None and collected.black is not None
-        away = np.abs(2 * bits - grey[collected.white] - grey[collected.black])
-        contrast, times = grey[collected.white] - grey[collected.black], 6.0
+    away = np.abs(contrasts(grey, stripes, collected)[list(coarse)])
+    contrast, times = (away.max(axis=0), 2.0) if stripes.inverses is not None else (grey[collected.white] - grey[collected.black], 6.0)
     contrast = np.maximum(contrast, 1e-9)
     deviation = np.sqrt(times * (noise.read**2 + noise.gain * np.maximum(bits.max(axis=0), 0))) / contrast
     return np.partition(away, 1, axis=0)[1] / contrast, deviation

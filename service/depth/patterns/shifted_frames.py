@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation, median_filter, uniform_filter
 
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
+from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import grey_of
 from stage.capture.manifest import Frame
 from stage.patterns.binary import BinaryCode
@@ -107,17 +108,14 @@ def find_shifts(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
     code = next((code for code in decoder.used if isinstance(code, BinaryCode | KaryCode)), None)
     if code is None or (isinstance(code, KaryCode) and code.colors is not None):
         return None
-    inverses = code.inverses if isinstance(code, BinaryCode) else None
-    if inverses is None and (collected.white is None or collected.black is None):
+    if code.lacks(collected.white, collected.black) is not None:
         return None
     lines = _on_lines(axis, across)
     grey, clipped = _readings(planes, _even_lines(axis, across), across)
-    shown = grey[list(code.frames)]
-    if inverses is not None:
-        other = grey[list(inverses)]
-        level = 0.5 + 0.5 * (shown - other) / np.maximum(np.abs(shown - other).max(axis=0), 1e-12)
-    else:
-        level = (shown - grey[collected.black]) / np.maximum(grey[collected.white] - grey[collected.black], 1e-12)
+    inverses = code.inverses if isinstance(code, BinaryCode) else None
+    contrast = contrasts(grey, code, collected)
+    white = np.abs(contrast).max(axis=0) if inverses is not None else grey[collected.white] - grey[collected.black]
+    level = 0.5 + 0.5 * contrast / np.maximum(white, 1e-12)
     known = lines.solved if clipped is None else lines.solved & ~clipped
     seen = binary_dilation(known, np.ones((1, 2 * BESIDE + 1), bool))
     near = median_filter(lines.coordinate, (1, AROUND))
