@@ -98,8 +98,8 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     mask = capture.mask()
     if request.beside is not None and using is not Ranging.PATTERN:
         raise RequestError(f"--beside {request.beside}: is for projected patterns, and {using} frames are measured")
-    if request.refine_projector and (using is not Ranging.PATTERN or request.beside is not None):
-        raise RequestError("--refine-projector: is for projected patterns and one camera: columns and rows tell where the projector is")
+    if request.refine_projector and using not in (Ranging.PATTERN, Ranging.STEREO):
+        raise RequestError(f"--refine-projector: is for projected patterns and two cameras, and {using} frames are measured")
     solution = (KINDS[using].solve(capture, mask, request, device, timings) if request.beside is None else
                 solve_two_cameras(capture, request.beside, mask, request, device, timings))
     least = solution.least_confidence if request.least_confidence is None else request.least_confidence

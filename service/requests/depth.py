@@ -87,7 +87,7 @@ class DepthOptions(PixelOptions):
     """Interpolate a Gray code with inverses between the edges of its stripes."""
     refine_projector: bool = False
     """Where columns and rows contradict the pose and the focal length of the projector, turn and zoom it so that they do not; the report
-    says by how much. Needs patterns of both axes."""
+    says by how much. Needs patterns of both axes. Of two cameras it is the other one that is turned and zoomed."""
     read_noise: Positive = 0.003
     """Standard deviation of a reading in the dark, quantisation included, as a fraction of full scale; patterns and stereo only."""
     photon_gain: NotNegative = 1e-4

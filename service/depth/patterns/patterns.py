@@ -11,6 +11,7 @@ from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded, cropped
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.base.epipolar import Contradiction, settled
 from service.depth.base.solution import DepthSolution
 from service.depth.base.triangulation_check import check_projector, missing_calibration
 from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, doubt_coordinates, doubt_pixels
@@ -18,7 +19,6 @@ from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
-from service.depth.patterns.epipolar import REFINEMENTS, contradicted, widen
 from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
@@ -26,6 +26,7 @@ from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
+from service.depth.patterns.projector_doubts import contradicted, widen
 from service.depth.patterns.readings import Readings
 from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.wave_checks import bent_back, check_waves
@@ -233,11 +234,35 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
 
 
+class Measured(NamedTuple):
+    """Depths, and each pixel's probability to be right."""
+
+    solution: DepthSolution
+    right: np.ndarray  # [rows, cols]
+
+
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
            frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
-           declared: bool, refined: int = 0) -> tuple[DepthSolution, np.ndarray]:
-    """Return the depth of each pixel and its probability to be right; fill the coordinates.
-    `declared`: whether the frames are what the manifest declares, as far as a sample has told. `refined`: how often the projector was."""
+           declared: bool) -> Measured:
+    """Return the depth of each pixel; fill the coordinates.
+    `declared`: whether the frames are what the manifest declares, as far as a sample tells."""
+    def measure(view: Projector, before: Contradiction | None) -> tuple[Measured, Contradiction | None]:
+        found = _triangulated(planes, mask, codes, coordinates, view, capture, frames, noise, device, request, timings, declared=declared)
+        u, v = coordinates.columns, coordinates.rows
+        return found, None if u is None or v is None else contradicted(found.solution, u, v, capture.camera, view, before)
+
+    _, found, contradiction = settled(projector, measure, refine=request.refine_projector and declared)
+    if contradiction is not None:
+        u, v = coordinates.columns, coordinates.rows
+        assert u is not None and v is not None  # they contradict it
+        widen(found.solution, u, v, capture.camera, contradiction, projector)
+    return found
+
+
+def _triangulated(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
+                  frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
+                  declared: bool) -> Measured:
+    """Return the depth of each pixel with one projector; fill the coordinates."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
@@ -279,14 +304,7 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
                              amplitude=coordinates.amplitude, facts=facts)
     solution.warnings += widened
-    right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
-    found = None if u is None or v is None else contradicted(solution, u, v, capture.camera, projector, refined=refined > 0)
-    if found is not None:
-        if request.refine_projector and declared and refined < REFINEMENTS:
-            return _bands(planes, mask, codes, coordinates, found[0].projector, capture, frames, noise, device, request, timings,
-                          declared=declared, refined=refined + 1)
-        widen(solution, *found, check_projector(capture), refined=refined > 0)
-    return solution, right
+    return Measured(solution, doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device))
 
 
 def _widen(planes: Planes, coordinates: Coordinates, codes: PatternCodes, frames: list[Frame],

@@ -10,25 +10,35 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
+from service.depth.base.epipolar import Contradiction, settled
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.frame_light import full_scale
-from service.depth.stereo.rectification import Rectification, rectified_frames, rectify
-from service.depth.stereo.stereo_pair import LEAST_PLACES, MOST_LABELS, SURE_LEAD, Disparity, Places, match, range_of, unique_places
+from service.depth.stereo.camera_doubts import ENOUGH, as_camera, as_projector, by_chance, contradicted, sentence, widened
+from service.depth.stereo.rectification import Rectification, RectifiedFrames, rectified_frames, rectify
+from service.depth.stereo.stereo_pair import (
+    LEAST_PLACES,
+    MOST_LABELS,
+    SURE_LEAD,
+    Disparity,
+    Places,
+    match,
+    range_of,
+    shifted_rows,
+    unique_places,
+)
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
+from stage.capture.camera import OtherCamera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Frame
+from stage.capture.projector import Projector
 from stage.errors import ManifestError
 from stage.stack.correction import Correction
 from stage.stack.planes import Planes
 
 BEHIND_SHARE = 0.5
 """Share of unique places behind the cameras from which the images are taken to be swapped."""
-ROW_OFFSET_PX = 0.12
-"""Median offset between the rows of both images from which the calibration is doubted."""
-LEAST_OFFSETS = 50
-"""Places from which an offset between rows is told."""
 AGREEMENT_SIGMAS = 4.0
 """Depths from two cameras agree when they differ by no more standard deviations."""
 ROWS_AT_ONCE = 256
@@ -40,7 +50,7 @@ CHANCE_SHARE = 0.03
 in a hundred by chance."""
 DOUBTED = 0.1
 """Factor of the confidence of depths that are not believed."""
-ENOUGH = 200
+ENOUGH_TEXTURED = 200
 """Pixels with texture from which their share tells something."""
 ADVICE = {
     Status.LOW_MODULATION: "the texture is not seen there: more light, a longer exposure, or a coarser pattern",
@@ -62,6 +72,15 @@ class PairDepth(NamedTuple):
     status: np.ndarray  # [rows, cols] uint8
 
 
+class Matched(NamedTuple):
+    """What matches in the images of two cameras."""
+
+    geometry: Rectification
+    span: tuple[float, float]
+    """The least and the largest disparity that was considered, between columns of the rectified images."""
+    disparity: Disparity
+
+
 def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
     """Match the frames under texture and triangulate them; depths outside the request's span are OUT_OF_RANGE."""
     check_perspective(capture)
@@ -70,38 +89,77 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
     facts: dict[str, Any] = {"frames": len(frames), "cameras": []}
     warnings: list[str] = []
     for index, other in enumerate(capture.manifest.other_cameras):
-        where = f"{capture.folder / FILE_NAME}: other_cameras[{index}]"
-        geometry = rectify(capture.camera, other, where=where)
-        timings.stage("frames", len(frames))
-        with rectified_frames(capture, frames, index, geometry, cache=request.cache, progress=timings.advance) as images:
-            full = full_scale(Planes(images.left[:, :, None], None), capture, frames)
-            noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
-            timings.stage("range", 1)
-            places = unique_places(images, device)
-            _check_order(places, geometry, where, other.name)
-            least, most = _span(places, geometry, request, where, other.name)
-            timings.stage("match", images.left.shape[1])
-            for rows, matched in match(images, least, most, noise, device):
-                timings.advance(rows)
-                disparity = matched
-        told = {"name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
-                "disparity_px": [_short(least + geometry.offset_px), _short(most + geometry.offset_px)],
-                "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
-        if len(disparity.row_offset) >= LEAST_OFFSETS:
-            offset = float(np.median(disparity.row_offset))
-            told["row_offset_px"] = statistics(disparity.row_offset)
-            if abs(offset) > ROW_OFFSET_PX:
-                warnings.append(f"other_cameras[{index}]: the rows of {other.name} lie {offset:+.2f} px from those of the camera (median "
-                                f"over {len(disparity.row_offset)} places): depths may be off by as much disparity; calibrate the cameras "
-                                "again (relit calibrate stereo)")
+        rectify(capture.camera, other, where=f"{capture.folder / FILE_NAME}: other_cameras[{index}]")  # checks it
+        given = as_projector(other, np.array(other.camera_from_other))
+
+        def measure(view: Projector, before: Contradiction | None, index: int = index, name: str = other.name) -> tuple[
+                Matched, Contradiction | None]:
+            matched = _matched(capture, frames, index, as_camera(view, name), request, device, timings)
+            return matched, contradicted(matched.disparity.offsets, matched.geometry, view, before)
+
+        view, matched, contradiction = settled(given, measure, refine=request.refine_projector)
+        geometry, disparity, offsets = matched.geometry, matched.disparity, matched.disparity.offsets
+        told: dict[str, Any] = {
+            "name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
+            "disparity_px": [_short(end + geometry.offset_px) for end in matched.span],
+            "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
+        if len(offsets.offset) >= ENOUGH:
+            told["row_offset_px"] = statistics(offsets.offset)
         facts["cameras"].append(told)
-        found.append(_triangulated(disparity, geometry, capture, request))
+        pair = _triangulated(disparity, geometry, capture, request)
+        believed = contradiction is None or contradiction.plausible
+        if believed and by_chance(offsets):
+            believed = False
+            warnings.append(f"frames: the places that match in the images of {other.name} lie in neighbouring rows at random, as in images "
+                            "that have nothing to do with each other: no depth is trusted")
+        elif contradiction is not None:
+            told["contradiction_px"] = _short(contradiction.size_px)
+            if view is not given:
+                told["refined"] = as_camera(view, other.name).model_dump(mode="json", exclude={"name", "resolution", "distortion"})
+            warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given))
+            pair = pair._replace(sigma=widened(pair.depth, pair.sigma, capture.camera, contradiction, given))
+        if not believed and request.least_confidence is None:
+            pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))
+        found.append(pair)
     solution = _joined(found, frames, capture, mask)
     solution.facts |= facts
     if request.least_confidence is None:
         warnings += _chance(solution, mask)
     solution.warnings += [*warnings, *_doubts(solution, mask)]
     return solution
+
+
+def _matched(capture: Capture, frames: list[Frame], index: int, other: OtherCamera, request: DepthRequest, device: str,
+             timings: Timings) -> Matched:
+    """Rectify the images of the camera and of another one, find the range of their disparities, and match them."""
+    where = f"{capture.folder / FILE_NAME}: other_cameras[{index}]"
+    geometry = rectify(capture.camera, other, where=where)
+    timings.stage("frames", len(frames))
+    with rectified_frames(capture, frames, index, geometry, cache=request.cache, progress=timings.advance) as images:
+        full = full_scale(Planes(images.left[:, :, None], None), capture, frames)
+        noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
+        timings.stage("range", 1)
+        places = unique_places(images, device)
+        _check_rows(images, places, geometry, where, other.name, device)
+        _check_order(places, geometry, where, other.name)
+        span = _span(places, geometry, request, where, other.name)
+        timings.stage("match", images.left.shape[1])
+        for rows, found in match(images, *span, noise, device):
+            timings.advance(rows)
+            disparity = found
+    return Matched(geometry, span, disparity)
+
+
+def _check_rows(images: RectifiedFrames, places: Places, geometry: Rectification, where: str, name: str, device: str) -> None:
+    """Refuse images whose rows lie so far apart that hardly any place matches."""
+    found = shifted_rows(images, places, device)
+    if found is not None:
+        rows, matched = found
+        angle = np.degrees(np.arctan(abs(rows) / geometry.focal_px))
+        way = "lower" if rows > 0 else "higher"
+        raise ManifestError(f"{where}: {len(places.disparity)} of {places.compared} places match between the camera and {name}, and "
+                            f"{matched} do where its rows lie {abs(rows)} px {way}: its calibration is wrong, as if it were turned by "
+                            f"{angle:.2f}° across the baseline; calibrate the cameras again (relit calibrate stereo)")
 
 
 def _check_order(places: Places, geometry: Rectification, where: str, name: str) -> None:
@@ -198,13 +256,13 @@ def _chance(solution: DepthSolution, mask: np.ndarray) -> list[str]:
     """Believe no depth where hardly any of the pixels with texture has one, and say so."""
     textured = mask & ~np.isin(solution.status, (Status.UNSOLVED, Status.LOW_MODULATION))
     solved, count = mask & solution.solved, int(textured.sum())
-    if not solved.any() or count < ENOUGH or solved.sum() >= CHANCE_SHARE * count:
+    if not solved.any() or count < ENOUGH_TEXTURED or solved.sum() >= CHANCE_SHARE * count:
         return []
     assert solution.confidence is not None  # `_joined` sets it
     solution.status[solved] = Status.UNSURE
     solution.confidence[solved] *= DOUBTED
     return [f"frames: only {100 * solved.sum() / count:.1f} % of the {count} pixels with texture match, as in images that have nothing to "
-            "do with each other: no depth is trusted"]
+            "do with each other, or whose rows a wrong calibration leaves apart: no depth is trusted"]
 
 
 def _doubts(solution: DepthSolution, mask: np.ndarray) -> list[str]:

@@ -17,16 +17,8 @@ from kernels.stereo.probe import probe
 from kernels.stereo.refine import refine
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.stereo.rectification import RectifiedFrames
-from stage.motion.resample import bicubic
+from service.depth.stereo.row_offsets import RowOffsets, row_offsets
 
-REACH = 5
-"""Half side of the window: 11 × 11 pixels."""
-STEPS = 3
-"""Gauss-Newton steps."""
-MOST_PX = 2.0
-"""Larger offsets are no longer found by steps from zero, and left out."""
-LEAST_GRADIENT = 1e-12
-"""Least sum of squared vertical differences in a window, as a fraction of the square of the largest reading."""
 VOLUME_BYTES = 192 << 20
 """Bytes of the costs of one band of rows, which bound the memory whatever the resolution."""
 BYTES_PER_LABEL = 3
@@ -47,6 +39,12 @@ UNIQUE = 0.2
 """Least lead of a place that counts for the range."""
 LEAST_PLACES = 20
 """Places that must be unique to find a range."""
+FOUND_SHARE = 0.2
+"""Share of unique places from which the rows of both images are not looked for elsewhere."""
+MOST_ROWS_OFF = 24
+"""Largest number of rows by which they are."""
+CHANCE_SIGMAS = 5.0
+"""By how many standard deviations a number of places must exceed that of images that have nothing to do with each other."""
 BIN_PX = 8
 """Width of the bins in which disparities of unique places are counted."""
 LEAST_IN_BIN = 3
@@ -80,8 +78,6 @@ BEND_SIGMAS, BEND_DOUBT = 0.6, 0.5
 """A bend counts as far as it exceeds this many σ, so that noise is not taken for one; and this part of what is taken off is added to σ."""
 SURE_LEAD = 0.3
 """Lead from which nothing is left to doubt."""
-SAMPLED_ROWS = 400
-"""Places of one band at which the offset between the rows of both images is measured."""
 
 
 class Disparity(NamedTuple):
@@ -94,13 +90,14 @@ class Disparity(NamedTuple):
     lead: np.ndarray  # [rows, cols] float32, by how much the best rival fits worse, relative to chance
     contrast: np.ndarray  # [rows, cols] float32, standard deviation of the texture around the pixel, in the unit of the images
     status: np.ndarray  # [rows, cols] uint8
-    row_offset: np.ndarray  # [places] float32, pixels by which the right image lies lower than the left one
+    offsets: RowOffsets
+    """By how much the right image lies lower than the left one, at places over the whole image."""
 
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> "Disparity":
         """Return arrays without any estimate."""
         disparity, slope_x, slope_y, sigma, lead, contrast = (np.zeros(shape, np.float32) for _ in range(6))
-        return cls(disparity, slope_x, slope_y, sigma, lead, contrast, np.zeros(shape, np.uint8), np.zeros(0, np.float32))
+        return cls(disparity, slope_x, slope_y, sigma, lead, contrast, np.zeros(shape, np.uint8), RowOffsets.none())
 
 
 class Places(NamedTuple):
@@ -133,6 +130,23 @@ def unique_places(images: RectifiedFrames, device: str) -> Places:
     return Places(np.concatenate(found), compared)
 
 
+def shifted_rows(images: RectifiedFrames, found: Places, device: str) -> tuple[int, int] | None:
+    """Return by how many rows the right image lies lower, and how many unique places it has then, where these are far more than as it is;
+    None where they are not, or enough are found as it is. `found`: the places as it is."""
+    if len(found.disparity) > FOUND_SHARE * found.compared:
+        return None
+    counts = {}
+    for shift in (way * size for size in range(2, MOST_ROWS_OFF + 1, 2) for way in (-1, 1)):
+        right, seen = np.zeros_like(images.right), np.zeros_like(images.right_seen)
+        here, there = (slice(max(0, -by), seen.shape[0] - max(0, by)) for by in (shift, -shift))
+        right[:, here], seen[here] = images.right[:, there], images.right_seen[there]
+        counts[shift] = len(unique_places(images._replace(right=right, right_seen=seen), device).disparity)
+    best = max(counts, key=lambda shift: counts[shift])
+    by_chance = float(np.median(list(counts.values())))
+    sure = counts[best] >= max(2 * len(found.disparity), LEAST_PLACES + by_chance + CHANCE_SIGMAS * by_chance**0.5)
+    return (best, counts[best]) if sure else None
+
+
 def range_of(places: Places) -> tuple[float, float] | None:
     """Return the least and the largest disparity of the scene, with a margin; None where too few places are unique."""
     if len(places.disparity) < LEAST_PLACES:
@@ -155,7 +169,6 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
     result = Disparity.empty((rows, cols))
     whole = VOLUME_BYTES // (BYTES_PER_LABEL * labels.count(device) * cols)
     step = max(LEAST_ROWS, whole - 2 * HALO)
-    offsets: list[np.ndarray] = []
     for first in range(0, rows, step):
         core = slice(first, min(first + step, rows))
         around = slice(max(core.start - HALO, 0), min(core.stop + HALO, rows))
@@ -165,9 +178,9 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
             whole_map[core] = part[kept]
         usable = found.status == Status.OK
         usable[:kept.start] = usable[kept.stop:] = False
-        offsets.append(row_offsets(images.left[0, around], images.right[0, around], found.disparity, found.slope_x, found.slope_y, usable,
-                                   most=SAMPLED_ROWS))
-        yield core.stop, result._replace(row_offset=np.concatenate(offsets))
+        offsets = row_offsets(images.left[0, around], images.right[0, around], found.disparity, found.slope_x, found.slope_y, usable)
+        result = result._replace(offsets=result.offsets.joined(offsets._replace(row=offsets.row + around.start)))
+        yield core.stop, result
 
 
 def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: NoiseModel, device: str) -> Disparity:
@@ -204,7 +217,7 @@ def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: Noi
     disparity, sigma = disparity - above, np.hypot(sigma, BEND_DOUBT * above)
     kept = found & np.isin(status, (Status.OK, Status.UNSURE))
     disparity, slope_x, slope_y, sigma = (np.where(kept, values, 0).astype(np.float32) for values in (disparity, slope_x, slope_y, sigma))
-    return Disparity(disparity, slope_x, slope_y, sigma, lead, texture, status, np.zeros(0, np.float32))
+    return Disparity(disparity, slope_x, slope_y, sigma, lead, texture, status, RowOffsets.none())
 
 
 WINDOW_REACH = 4
@@ -256,56 +269,3 @@ def bend(disparity: np.ndarray, usable: np.ndarray) -> np.ndarray:
         mean = box_mean(np.where(known, second, 0), WINDOW_REACH) / np.maximum(share, 1e-9)
         total += np.where(share > LEAST_KNOWN, mean, 0) / WINDOW_REACH**2
     return total / 2 * MEAN_SQUARE
-
-
-# The offset between the rows of two rectified images, which a wrong calibration leaves, measured at matched places.
-
-def row_offsets(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray, usable: np.ndarray, *,
-                most: int) -> np.ndarray:
-    """Measure by how many rows the right image lies lower than the left one.
-
-    Args:
-        left: [rows, cols] float32.
-        right: [rows, right cols] float32.
-        disparity, slope_x, slope_y: [rows, cols] float32, refined.
-        usable: [rows, cols] bool, where the disparity holds.
-        most: of how many places at most, evenly drawn.
-
-    Returns:
-        [places] float32, pixels.
-
-    Source:
-        Lucas and Kanade, "An iterative image registration technique with an application to stereo vision", IJCAI 1981, with a gain and an
-        offset of brightness; the disparity stays as it is.
-    """
-    inner = np.zeros_like(usable)
-    inner[REACH:-REACH, REACH:-REACH] = usable[REACH:-REACH, REACH:-REACH]
-    row, col = np.nonzero(inner)
-    if not len(row):
-        return np.zeros(0, np.float32)
-    chosen = np.linspace(0, len(row) - 1, min(most, len(row))).astype(int)
-    row, col = row[chosen], col[chosen]
-    dy, dx = (grid.ravel() for grid in np.mgrid[-REACH:REACH + 1, -REACH:REACH + 1])
-    plane = disparity[row, col][:, None] + slope_x[row, col][:, None] * dx + slope_y[row, col][:, None] * dy
-    values = left[row[:, None] + dy, col[:, None] + dx].astype(np.float64)
-    values -= values.mean(axis=1, keepdims=True)
-    x = (col[:, None] + dx - plane).astype(np.float32)
-    offset = np.zeros(len(row))
-    for _ in range(STEPS):
-        y = (row[:, None] + dy + offset[:, None]).astype(np.float32)
-        here, below, above = (_at(right, x, y + shift) for shift in (0.0, 0.5, -0.5))
-        here -= here.mean(axis=1, keepdims=True)
-        gain = (values * here).sum(axis=1) / np.maximum((here**2).sum(axis=1), 1e-30)
-        slope = gain[:, None] * (below - above)
-        slope -= slope.mean(axis=1, keepdims=True)
-        weight = (slope**2).sum(axis=1)
-        floor = LEAST_GRADIENT * float(np.abs(left).max()) ** 2
-        offset += np.where(weight > floor, (slope * (values - gain[:, None] * here)).sum(axis=1) / np.maximum(weight, 1e-30), 0)
-        offset = np.clip(offset, -MOST_PX, MOST_PX)
-    return offset[np.abs(offset) < MOST_PX].astype(np.float32)
-
-
-def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return an image at places, which are clamped to it: float64 in the shape of x."""
-    return bicubic(image, np.clip(x, 0, image.shape[1] - 1).astype(np.float32), np.clip(y, 0, image.shape[0] - 1).astype(np.float32)
-                   ).astype(np.float64)

@@ -16,14 +16,17 @@ from kernels.packs import padded_count
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.triangulate import triangulate
+from service.depth.base.epipolar import Contradiction, contradiction, settled
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective, check_projector
 from service.depth.patterns.agreement import conclude, doubt_pixels
 from service.depth.patterns.coordinates import DecodedSolution
 from service.depth.patterns.patterns import projector_model, solve_patterns
+from service.depth.stereo.camera_doubts import LEAST_PX, as_projector, sentence, widened
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
+from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
 from stage.capture.projector import Projector, UncalibratedProjector
@@ -69,8 +72,8 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
     other = Capture.open(beside, request.pixels._replace(crop=None))
     for each in (capture, other):
         check_perspective(each)
-    seen_by = _as_projector(capture, other)
-    plain = request.model_copy(update={"near_m": None, "far_m": None, "max_sigma": None, "normals": False})
+    given = _second_camera(capture, other)
+    plain = request.model_copy(update={"near_m": None, "far_m": None, "max_sigma": None, "normals": False, "refine_projector": False})
     images = []
     for each, inside in ((capture, mask), (other, other.mask())):
         found = solve_patterns(_uncalibrated(each), inside, plain, device, timings)
@@ -91,42 +94,80 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         plane[wanted] = values
     status = own.status.copy()
     status[wanted] = np.where(places.found, own.status[wanted], int(Status.OCCLUDED))
-    x, y = capture.camera.plane_coordinates()
-    u, v = (_decoded(planes[axis], planes[axis + 2], own.coordinates.amplitude, status, device) for axis in (0, 1))
-    found_depth = triangulate(x.ravel().astype(np.float32), y.ravel().astype(np.float32), u, v, projector_model(seen_by),
-                              near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px,
-                              device=device)
-    depth, sigma, residual, code = (to_numpy(array)[:mask.size].reshape(mask.shape) for array in found_depth)
-    status = np.where(status == Status.OCCLUDED, status, code).astype(np.uint8)
-    kept = np.isin(status, ESTIMATED) & (depth > 0)
-    status[~mask] = int(Status.UNSOLVED)
-    solution = DepthSolution(method=f"{own.method}, two cameras", depth=np.where(kept, depth, 0).astype(np.float32), status=status,
-                             sigma=np.where(kept, sigma, 0).astype(np.float32), projector_u=first.column, projector_v=first.row,
-                             sigma_u=first.sigma_column, sigma_v=first.sigma_row, amplitude=own.coordinates.amplitude)
-    solution.facts = {**own.facts, "beside": {"capture": str(beside), "matched": int(places.found.sum()),
-                                              "residual_px": statistics(residual[np.isin(status, SOLVED)])}}
+
+    def measure(view: Projector, before: Contradiction | None) -> tuple[tuple[DepthSolution, np.ndarray], Contradiction | None]:
+        solution, residual = _intersected(own, planes, status, mask, capture.camera, view, request, device)
+        judged = solution.solved
+        u, v, sigma_u, sigma_v = (plane[judged] for plane in planes)
+        return (solution, residual), contradiction(
+            view, capture.camera.points(-solution.depth)[judged], np.stack([u, v], axis=1), np.stack([sigma_u, sigma_v], axis=1),
+            least_px=LEAST_PX, alike=float(2 * REACH + 1) ** 2, before=before)
+
+    view, (solution, residual), contradicted = settled(given, measure, refine=request.refine_projector)
+    told = {"capture": str(beside), "matched": int(places.found.sum()), "residual_px": statistics(residual[solution.solved])}
+    solution.facts = {**own.facts, "beside": told}
     solution.facts.pop("decoded_only", None)
-    conclude(solution, doubt_pixels(solution, residual, capture.camera, seen_by, device), mask, request, [])
+    warnings = []
+    if contradicted is not None:
+        assert solution.sigma is not None
+        solution.sigma = widened(solution.depth, solution.sigma, capture.camera, contradicted, given)
+        warnings.append(sentence("--beside: camera", contradicted, given))
+        told["contradiction_px"] = float(f"{contradicted.size_px:.3g}")
+        if view is not given:
+            pose = _world(capture) @ np.array(view.camera_from_projector)
+            told["refined"] = {"focal_px": view.focal_px, "principal_px": view.principal_px, "world_from_camera": pose.tolist()}
+        if not contradicted.plausible and request.least_confidence is None:
+            solution.status[solution.solved] = Status.UNSURE
+    conclude(solution, doubt_pixels(solution, residual, capture.camera, view, device), mask, request, warnings)
     return solution
 
 
-def _as_projector(capture: Capture, other: Capture) -> Projector:
+def _intersected(own: DecodedSolution, planes: list[np.ndarray], status: np.ndarray, mask: np.ndarray, camera: Camera, seen_by: Projector,
+                 request: DepthRequest, device: str) -> tuple[DepthSolution, np.ndarray]:
+    """Return where the lines of sight of both cameras meet, and by how many pixels of the second they miss each other, [rows, cols].
+
+    Args:
+        own: what the first camera has decoded.
+        planes: columns and rows of the places in the second camera, and their standard deviations, each [rows, cols] pixels.
+        status: [rows, cols] of the places.
+        seen_by: the second camera.
+    """
+    x, y = camera.plane_coordinates()
+    u, v = (_decoded(planes[axis], planes[axis + 2], own.coordinates.amplitude, status, device) for axis in (0, 1))
+    found = triangulate(x.ravel().astype(np.float32), y.ravel().astype(np.float32), u, v, projector_model(seen_by),
+                        near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px, device=device)
+    depth, sigma, residual, code = (to_numpy(array)[:mask.size].reshape(mask.shape) for array in found)
+    status = np.where(status == Status.OCCLUDED, status, code).astype(np.uint8)
+    kept = np.isin(status, ESTIMATED) & (depth > 0)
+    status[~mask] = int(Status.UNSOLVED)
+    columns, rows = own.coordinates.columns, own.coordinates.rows
+    assert columns is not None and rows is not None  # `solve_two_cameras` has checked it
+    return DepthSolution(
+        method=f"{own.method}, two cameras", depth=np.where(kept, depth, 0).astype(np.float32), status=status,
+        sigma=np.where(kept, sigma, 0).astype(np.float32), projector_u=columns.coordinate, projector_v=rows.coordinate,
+        sigma_u=columns.sigma, sigma_v=rows.sigma, amplitude=own.coordinates.amplitude), residual
+
+
+def _second_camera(capture: Capture, other: Capture) -> Projector:
     """Return the second camera as the projector of the first, checked as one."""
     camera = other.camera
     if camera.world_from_camera is None:
         raise ManifestError(f"{other.folder / FILE_NAME}: camera.world_from_camera: is missing: two cameras are triangulated by their "
                             "poses in one world (that of the first camera, where its capture gives none)")
-    world = np.eye(4) if capture.camera.world_from_camera is None else np.array(capture.camera.world_from_camera)
-    pose = np.linalg.inv(world) @ np.array(camera.world_from_camera)
-    seen_by = Projector.model_validate({
-        "resolution": camera.resolution, "focal_px": camera.focal_px, "principal_px": camera.principal_px, "distortion": camera.distortion,
-        "camera_from_projector": pose.tolist()})
+    pose = np.linalg.inv(_world(capture)) @ np.array(camera.world_from_camera)
+    seen_by = as_projector(camera, pose)
     try:
         return check_projector(replace(capture, manifest=capture.manifest.model_copy(update={"projector": seen_by})))
     except ManifestError as error:
         raise ManifestError(str(error).replace(f"{capture.folder / FILE_NAME}: projector.camera_from_projector",
                                                f"{other.folder / FILE_NAME}: camera.world_from_camera").replace(
                                                    "the projector", "the second camera")) from error
+
+
+def _world(capture: Capture) -> np.ndarray:
+    """Return the pose of a camera in the world, [4, 4] metres: that of its capture, or of the world itself."""
+    pose = capture.camera.world_from_camera
+    return np.eye(4) if pose is None else np.array(pose)
 
 
 def _uncalibrated(capture: Capture) -> Capture:

@@ -132,7 +132,7 @@ def test_most_pixels_refused_is_said(relit, tmp_path, light):
     patterns = (*binary_patterns(WIDTH, "column", references=False), *binary_patterns(RIG.projector[1], "row"))
     write_capture(tmp_path, ROOM, patterns, light=light, focal_px=[2 * RIG.projector_focal] * 2)
     maps, report, _ = solve(relit, tmp_path)
-    assert "lit pixels have a depth that can be trusted; most of the" in report["warnings"][0]
+    assert any("lit pixels have a depth that can be trusted; most of the" in sentence for sentence in report["warnings"])
     assert maps.confidence[maps.mask].max() < 0.2
 
 

@@ -1,0 +1,203 @@
+"""Whether the places at which a projector or another camera sees points contradict its calibration, and by how much depths may be off.
+
+A point of a line of sight can only be imaged on one line of the second view, its epipolar line. Noise leaves places to both sides of it; a
+view that is turned or zoomed otherwise than declared leaves them to one side over whole parts of the image. The turn, the zoom and the
+direction of the baseline that explain the places best are fitted, and tell what the error along the line is, which no pixel shows.
+
+How far off calibrations usually are is not known beforehand: one factor for all parameters is fitted with them, so that small
+contradictions leave small errors open.
+
+Source: MacKay, "Bayesian interpolation", Neural Computation 4, 1992, for the factor.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stage.capture.projector import Projector
+from stage.transforms import OPENCV_FROM_CAMERA
+
+PRIOR = np.array([0.02, 0.02, 0.02, 0.03, 0.02, 0.02, 0.015, 0.015])
+"""Errors of bad calibrations, whose ratios are those of good ones: turns about the view's axes in rad, the part of the focal length, turns
+of the baseline in rad, and places of the principal point as parts of the focal length."""
+LARGEST = 3.0
+"""Largest parameter of a view that may be what was calibrated, in errors of bad calibrations."""
+UNSEEN = 3.0
+"""How many times as large as the factor says errors may be, because those that no line shows may be larger than those that lines show."""
+STEP = 1e-4
+"""Change of a parameter by which derivatives are taken."""
+MOST_POINTS = 20_000
+"""Number of points, evenly spread, that are fitted."""
+ENOUGH = 33
+"""Number of points whose errors are their own, below which nothing is concluded."""
+LEAST_GAIN = 50.0
+"""Least drop of the squared residuals over their variance that tells a contradiction."""
+ROUNDS = 24
+"""Number of fits from which the factor of the errors is found, each with the weights of Cauchy and the factor that the one before gives."""
+LAST_ROUNDS = 6
+"""Number of fits with that factor."""
+
+
+REFINEMENTS = 3
+"""Largest number of times that a view is refined, each by what is triangulated with the one before."""
+
+Found = TypeVar("Found")
+
+
+class Contradiction(NamedTuple):
+    """Evidence of systematic residuals against a calibration."""
+
+    size_px: float
+    """Distance of the places from the epipolar lines that the fit explains, root mean square."""
+    noise_px: float
+    """Median distance that is left."""
+    declared: Projector
+    """The view as it was given."""
+    projector: Projector
+    """The view that explains the places best."""
+    part: np.ndarray  # [8] changes of the parameters from the declared view to the one that was found, in units of PRIOR
+    covariance: np.ndarray  # [8, 8] of these changes
+    whole: np.ndarray  # [8] changes from the view as it was given
+
+    @property
+    def plausible(self) -> bool:
+        """Return whether a view may be calibrated so badly; otherwise something else is wrong."""
+        return bool(np.abs(self.whole).max() <= LARGEST)
+
+    def moved(self, points: np.ndarray, deviations: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much depths differ with the view that was found, and their standard deviation with it, each [points] metres.
+        `points`: [points, 3] metres, camera frame, as triangulated. `deviations`: [points, 2] of the places from which they were; None:
+        alike."""
+        by, way = _derivatives(self.declared, points)
+        trust = 1.0 if deviations is None else 1 / np.maximum(deviations.T, 1e-3)**2
+        depths = points[:, 2]**2 * (by * trust * way).sum(axis=1) / (trust * way**2).sum(axis=0) * PRIOR[:, None]
+        return self.part @ depths, np.sqrt(np.einsum("ip,ij,jp->p", depths, self.covariance, depths))
+
+    def error(self, points: np.ndarray, deviations: np.ndarray | None = None, *, given: Projector) -> np.ndarray:
+        """Return by how much depths that are those of the declared view may be off, [points] metres; see `moved`.
+        `given`: the view as it was given. If that was refined to the declared one, the baseline may be as much longer as it was turned,
+        which no line shows."""
+        ways = [np.array(each.camera_from_projector)[:3, 3] for each in (given, self.declared)]
+        return np.hypot(np.hypot(*self.moved(points, deviations)),
+                        points[:, 2] * np.linalg.norm(ways[1] - ways[0]) / np.linalg.norm(ways[0]))
+
+
+def difference(declared: Projector, found: Projector) -> str:
+    """Return how a view that was found differs from the declared one, for a sentence."""
+    poses = [np.array(each.camera_from_projector)[:3, :3] for each in (declared, found)]
+    turn = float(np.degrees(Rotation.from_matrix(poses[0].T @ poses[1]).magnitude()))
+    return f"as if it were turned by {turn:.2f}° from there and its focal_px {found.focal_px[0] / declared.focal_px[0]:.3f} times that"
+
+
+def _image(projector: Projector, q: np.ndarray) -> np.ndarray:
+    """Return the place [2, pixels] in the projector of points [3, pixels] in its frame, from the principal point."""
+    x, y = q[0] / q[2], q[1] / q[2]
+    if projector.distortion is not None:
+        x, y = projector.distortion.apply(x, y)
+    return np.stack([projector.focal_px[0] * x, projector.focal_px[1] * y])
+
+
+def _across(shift: np.ndarray) -> np.ndarray:
+    """Return two vectors [2, 3] as long as a baseline, at right angles to it and to each other."""
+    return np.asarray(np.linalg.svd(shift[None])[2][1:] * np.linalg.norm(shift))
+
+
+def _derivatives(projector: Projector, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return those of the places of points [pixels, 3] by the parameters, [8, 2, pixels], and by the inverse depth, [2, pixels]."""
+    matrix = projector.projector_from_camera()
+    shift = matrix[:, 3]
+    q = matrix[:, :3] @ points.T + shift[:, None]
+    moves = [np.cross(axis, q.T).T for axis in np.eye(3)] + [np.broadcast_to(way[:, None], q.shape) for way in _across(shift)]
+    found = [(_image(projector, q + STEP * move) - _image(projector, q - STEP * move)) / (2 * STEP) for move in moves]
+    found.insert(3, _image(projector, q))
+    found += [np.broadcast_to(side[:, None], found[3].shape) for side in np.diag(projector.focal_px)]
+    depth = -points[:, 2]
+    move = depth * shift[:, None]  # of q times depth, which has the same image
+    return np.stack(found), (_image(projector, q + STEP * move) - _image(projector, q - STEP * move)) / (2 * STEP)
+
+
+def _turned(projector: Projector, part: np.ndarray) -> Projector:
+    """Return a projector whose parameters are changed, [8] as PRIOR has them."""
+    matrix = projector.projector_from_camera()
+    turn = Rotation.from_rotvec(part[:3]).as_matrix()
+    shift = turn @ matrix[:, 3] + part[4:6] @ _across(matrix[:, 3])
+    shift *= np.linalg.norm(matrix[:, 3]) / np.linalg.norm(shift)
+    rotation = turn @ matrix[:, :3]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T @ OPENCV_FROM_CAMERA, -rotation.T @ shift
+    middle = projector.principal_px or (projector.resolution[0] / 2, projector.resolution[1] / 2)
+    return Projector.model_validate({
+        **projector.model_dump(), "camera_from_projector": pose.tolist(), "focal_px": [one * (1 + part[3]) for one in projector.focal_px],
+        "principal_px": [place + move * focal for place, move, focal in zip(middle, part[6:], projector.focal_px, strict=True)]})
+
+
+def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, deviations: np.ndarray, *, least_px: float,
+                  alike: float = 1.0, before: Contradiction | None = None) -> Contradiction | None:
+    """Return how the places of points contradict the calibration of a view, None where noise explains them.
+
+    Args:
+        projector: the view, a projector or another camera.
+        points: [points, 3] metres, camera frame, as triangulated.
+        places: [points, 2] measured columns and rows in the view, continuous pixels.
+        deviations: [points, 2] their standard deviations.
+        least_px: least systematic distance from the epipolar lines that is one.
+        alike: number of neighbours whose errors are counted as one.
+        before: the contradiction by which the view was found. How far the view is from the one that was given then counts, and what the
+            fit leaves open, however well it explains the places.
+    """
+    if len(points) < ENOUGH * alike:
+        return None
+    chosen = slice(None, None, -(-len(points) // MOST_POINTS))
+    by, way = _derivatives(projector, points[chosen])
+    normal = np.stack([-way[1], way[0]]) / np.maximum(np.hypot(*way), 1e-12)
+    off = (normal * (places[chosen] - projector.project(points[chosen])[0]).T).sum(axis=0)
+    slopes = (by * normal).sum(axis=1).T * PRIOR  # [points, 8] of parameters in units of PRIOR
+    own = np.sqrt(((normal * deviations[chosen].T)**2).sum(axis=0) + 1e-6)
+    part, factor = np.zeros(len(PRIOR)), 1.0
+    so_far = np.zeros(len(PRIOR)) if before is None else before.whole
+
+    def fitted() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the parameters, their covariance, and the weights of the points that the parameters before gave."""
+        left = (off - slopes @ part) / own
+        scale = max(1.0, float(np.median(np.abs(left))) / 0.6745)
+        weight = 1 / (1 + (left / (3 * scale))**2) / (own * scale)**2 / alike
+        covariance = np.linalg.inv((slopes * weight[:, None]).T @ slopes + np.eye(len(PRIOR)) / factor**2)
+        return covariance @ ((slopes * weight[:, None]).T @ off - so_far / factor**2), covariance, weight
+
+    for _ in range(ROUNDS):
+        part, covariance, _ = fitted()
+        factor = float(np.sqrt(((so_far + part) @ (so_far + part) + np.trace(covariance)) / len(PRIOR)))
+    factor *= UNSEEN
+    for _ in range(LAST_ROUNDS):
+        part, covariance, weight = fitted()
+    left = off - slopes @ part
+    size = float(np.sqrt(np.mean((slopes @ part)**2)))
+    gain = float((weight * (off**2 - left**2)).sum())
+    if before is None and (size < least_px or gain < LEAST_GAIN):
+        return None
+    return Contradiction(size, float(np.median(np.abs(left))), projector, _turned(projector, part * PRIOR), part, covariance,
+                         so_far + part)
+
+
+def settled(view: Projector, measure: Callable[[Projector, Contradiction | None], tuple[Found, Contradiction | None]], *,
+            refine: bool) -> tuple[Projector, Found, Contradiction | None]:
+    """Measure with a view as it was given, and, where this is asked for, with the one that the places tell, again and again.
+
+    Args:
+        view: as it was given.
+        measure: what measures with a view, and returns what it found and how that contradicts the view. It gets the view, and the
+            contradiction by which it was found, None for the view as it was given.
+        refine: whether this is asked for.
+
+    Returns:
+        The view, what was measured with it, and how that contradicts it still.
+    """
+    before: Contradiction | None = None
+    for left in reversed(range(REFINEMENTS + 1 if refine else 1)):
+        found, contradicted = measure(view, before)
+        if contradicted is None or not contradicted.plausible or not left:
+            break
+        view, before = contradicted.projector, contradicted
+    return view, found, contradicted
