@@ -11,6 +11,7 @@ from kernels.device import to_numpy
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
+from service.calibrate.solvers.bundle import Certainty
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
@@ -42,6 +43,7 @@ class ProcamResult(NamedTuple):
     """View, camera error, projector error, remark."""
     rms_px: float
     baseline_m: float
+    certainty: Certainty
 
 
 def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> ProcamResult:
@@ -147,7 +149,8 @@ def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ..
     left = [{"view": name, "remark": remark} for name, remark in remarks.items() if name not in used]
     baseline = float(np.linalg.norm(found.camera_from_projector[:3, 3]))
     section = {"captures": [str(path) for path in request.captures], "rms_px": float(f"{found.rms_px:.4g}"),
-               "baseline_m": float(f"{baseline:.6g}"), "camera": lens_facts(found.camera), "projector": lens_facts(found.projector),
+               "baseline_m": float(f"{baseline:.6g}"), "sigma": found.certainty.facts(),
+               "camera": lens_facts(found.camera), "projector": lens_facts(found.projector),
                "views": entries, "left_out": left}
     reports = [write_results("procam", request, _updated(capture.manifest, found, size), path, section)
                for capture, path in zip(targets, paths, strict=True)]
@@ -155,7 +158,7 @@ def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ..
         (view.name, f"{camera:.3f}", f"{lit:.3f}", remarks.get(view.name, ""))
         for view, camera, lit in zip(views, found.camera_error_px, found.projector_error_px, strict=True)]
     rows += [(name, "", "", remark) for name, remark in remarks.items() if name not in used]
-    return ProcamResult(paths, reports[0], rows, found.rms_px, baseline)
+    return ProcamResult(paths, reports[0], rows, found.rms_px, baseline, found.certainty)
 
 
 def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:

@@ -1,9 +1,7 @@
 """Calibration of several cameras from a chessboard that they see at the same moments, with the error of each view.
 
-Each camera is calibrated by Zhang's method from its own views of the board; the pose of each other camera then follows from the views
-that it shares with the first, with the intrinsics of both held. So the first camera has the same intrinsics beside every other one.
-
-Source: Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3.
+All cameras, and the poses of the board in all frames, are fitted to all corners at once (solvers/bundle.py), also to those of frames that
+some of the cameras alone see.
 
 Convention: as in solvers/procam.py: image coordinates have pixel centres at halves, points in space are on OpenCV's axes.
 """
@@ -16,8 +14,9 @@ import cv2
 import numpy as np
 
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
-from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
-from service.calibrate.solvers.procam import LEAST_VIEWS, LENS_FLAGS, Lens, board_points, lens_of
+from service.calibrate.solvers.bundle import Certainty, Sight, adjust, alone
+from service.calibrate.solvers.charuco import charuco_of, find_board
+from service.calibrate.solvers.procam import LEAST_VIEWS, Lens, board_points, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
 from stage.capture.camera import OtherCamera
@@ -32,21 +31,22 @@ MOST_ERROR_PX = 0.5
 """Error of a view, root mean square, from which it is remarked on."""
 
 
-class SharedView(NamedTuple):
-    """The corners of the board in one pose, as two cameras see them."""
+class BoardFrame(NamedTuple):
+    """The corners that each camera sees in one frame, or why it sees none."""
 
     name: str
-    first: np.ndarray  # [corners, 2] image coordinates of the first camera
-    other: np.ndarray  # [corners, 2] image coordinates of the other camera, in the same order
+    corners: tuple[np.ndarray | str, ...]  # [corners, 2] of the first camera and of each other one
 
 
-class StereoPose(NamedTuple):
-    """The pose of another camera, with the errors of the views that it shares with the first."""
+class OtherCalibration(NamedTuple):
+    """Another camera, with its errors."""
 
+    lens: Lens
     camera_from_other: np.ndarray  # [4, 4] float64, metres, camera frames
-    first_error_px: np.ndarray  # [views] root mean square of each view, of the first camera
-    other_error_px: np.ndarray  # [views] the same of the other camera
     rms_px: float
+    certainty: Certainty
+    views: list[tuple[str, float, float]]
+    """Of each frame in which the first camera sees the board too: its name, and the errors of both in pixels, root mean square."""
 
 
 def alike_order(first: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -58,54 +58,43 @@ def alike_order(first: np.ndarray, other: np.ndarray) -> np.ndarray:
     return other if (first[-1] - first[0]) @ (other[-1] - other[0]) >= 0 else other[::-1]
 
 
-def _seen_by_both(first: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.asarray(np.isfinite(first).all(axis=-1) & np.isfinite(other).all(axis=-1))
-
-
-def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square_m: float, size: Resolution, name: str) -> Lens:
-    """Calibrate one camera from the image coordinates of all corners of the board in each view, [corners, 2], NaN where
-    one is not seen."""
-    if len(corners) < LEAST_VIEWS:
-        raise CalibrationError(f"{name}: {len(corners)} of the views show the board: give {LEAST_VIEWS} or more, the board tilted "
-                               "differently in each")
-    every, seen = board_points(board, square_m), [np.isfinite(view).all(axis=-1) for view in corners]
-    points = [every[kept] for kept in seen]
-    shown = [view[kept].astype(np.float32) for view, kept in zip(corners, seen, strict=True)]
-    try:
-        rms, k, d, _, _ = cv2.calibrateCamera(points, shown, size, None, None, flags=LENS_FLAGS)
-    except cv2.error as error:
-        raise CalibrationError(f"{name}: the poses of the board do not determine the camera ({str(error.err).strip().lower()}): tilt it "
-                               "differently from view to view") from error
-    lens = lens_of(k, d, rms)
-    if not (np.isfinite(lens.focal).all() and 0.1 < max(lens.focal) / max(size) < 100):
-        raise CalibrationError(f"{name}: the focal length comes out as {lens.focal[0]:.3g} px: the poses do not determine it, tilt the "
-                               "board differently from view to view")
-    return lens
-
-
-def calibrate_pose(views: Sequence[SharedView], board: tuple[int, int], square_m: float, first: Lens, other: Lens, size: Resolution,
-                   name: str) -> StereoPose:
-    """Find where another camera stands, from three views or more of the corners that both see; `size` is that of the first camera's
-    images."""
-    if len(views) < LEAST_VIEWS:
-        raise CalibrationError(f"{name}: {len(views)} of the views show the board to it and to the first camera: give {LEAST_VIEWS} or "
-                               "more")
-    every, kept = board_points(board, square_m), [_seen_by_both(view.first, view.other) for view in views]
-    points = [every[both] for both in kept]
-    seen = [view.first[both].astype(np.float32) for view, both in zip(views, kept, strict=True)]
-    also = [view.other[both].astype(np.float32) for view, both in zip(views, kept, strict=True)]
-    stop = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9
-    rms, _, _, _, _, rotation, translation, _, _, _, _, errors = cv2.stereoCalibrateExtended(
-        points, seen, also, *_matrices(first), *_matrices(other), size, np.eye(3), np.zeros((3, 1)), flags=cv2.CALIB_FIX_INTRINSIC,
-        criteria=stop)
-    return StereoPose(camera_from_projector(rotation, translation.ravel()), errors[:, 0], errors[:, 1], float(rms))
-
-
-def _matrices(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Return the camera matrix and the distortion vector of OpenCV, for corners whose pixel centres lie at halves."""
-    (k1, k2, k3), (p1, p2) = lens.distortion.k, lens.distortion.p
-    matrix = np.array([[lens.focal[0], 0, lens.principal[0]], [0, lens.focal[1], lens.principal[1]], [0, 0, 1]])
-    return matrix, np.array([k1, k2, p1, p2, k3])
+def calibrate(frames: Sequence[BoardFrame], cameras: Sequence[tuple[str, Resolution]], board: tuple[int, int],
+              square_m: float) -> tuple[Lens, list[OtherCalibration]]:
+    """Calibrate cameras from all that they see of a board at the same moments.
+    `cameras`: name and size of each. Returns the lens of the first one, and the other ones."""
+    every = board_points(board, square_m)
+    sights: list[list[Sight]] = [[] for _ in cameras]
+    for view, frame in enumerate(frames):
+        for device, corners in enumerate(frame.corners):
+            if not isinstance(corners, str):
+                seen = np.isfinite(corners).all(axis=-1)
+                sights[device].append(Sight(device, view, every[seen], corners[seen]))
+    firsts = {sight.view for sight in sights[0]}
+    for device, (name, _) in enumerate(cameras):
+        reasons = [corners for frame in frames if isinstance(corners := frame.corners[device], str)]
+        if len(reasons) == len(frames):
+            raise CalibrationError(f"{name}: 0 of the views show the board: {reasons[0]}")
+        if len(sights[device]) < LEAST_VIEWS:
+            raise CalibrationError(f"{name}: {len(sights[device])} of the views show the board: give {LEAST_VIEWS} or more, the board "
+                                   "tilted differently in each")
+        shared = sum(sight.view in firsts for sight in sights[device])
+        if shared < LEAST_VIEWS:
+            raise CalibrationError(f"{name}: {shared} of the views show the board to it and to the first camera: give {LEAST_VIEWS} or "
+                                   "more")
+    devices = [alone(own, size, name) for own, (name, size) in zip(sights, cameras, strict=True)]
+    found = adjust([sight for own in sights for sight in own], devices)
+    lenses = [lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True)]
+    errors = {(sight.device, sight.view): float(error) for sight, error in zip(found.sights, found.errors_px, strict=True)}
+    others = []
+    for device, (name, _) in list(enumerate(cameras))[1:]:
+        both = [sight.view for sight in sights[device] if sight.view in firsts]
+        pairs = [(frames[view].name, errors[0, view], errors[device, view]) for view in both]
+        counts = [(len(own.board), error) for own, error in zip(found.sights, found.errors_px, strict=True)
+                  if own.device in (0, device) and own.view in both]
+        rms = float(np.sqrt(np.average([error**2 for _, error in counts], weights=[count for count, _ in counts])))
+        pose = camera_from_projector(cv2.Rodrigues(found.places[device, :3])[0], found.places[device, 3:])
+        others.append(OtherCalibration(lenses[device], pose, rms, found.certainty(device, name), pairs))
+    return lenses[0], others
 
 
 class StereoResult(NamedTuple):
@@ -117,14 +106,8 @@ class StereoResult(NamedTuple):
     rows: list[tuple[str, ...]]
     """Frame, other camera, error of the first camera, of the other, remark."""
     summary: str
-    """Error and baseline of each other camera."""
-
-
-class BoardFrame(NamedTuple):
-    """The corners that each camera sees in one frame, or why it sees none."""
-
-    name: str
-    corners: tuple[np.ndarray | str, ...]  # [corners, 2] of the first camera and of each other one
+    """Error and baseline of each other camera, and how sure depths are."""
+    warnings: list[str]
 
 
 def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> StereoResult:
@@ -145,23 +128,18 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
     for frame in frames:
         assert frame.stereo is not None  # chosen so
         names = frame.image, *frame.stereo.images
-        found.append(BoardFrame(frame.image, tuple(_corners(capture, name, request) for name in names)))
+        corners = [_corners(capture, name, request) for name in names]
+        first = next((each for each in corners if not isinstance(each, str)), None)
+        if request.markers is None and first is not None:
+            corners = [each if isinstance(each, str) else alike_order(first, each) for each in corners]
+        found.append(BoardFrame(frame.image, tuple(corners)))
         timings.advance(len(found))
     timings.stage("fit", 1)
-    cameras = capture.manifest.other_cameras
-    named = [(capture.camera.resolution, "the camera"), *((other.resolution, other.name) for other in cameras)]
-    for number, (_, name) in enumerate(named):
-        reasons = [corners for frame in found if isinstance(corners := frame.corners[number], str)]
-        if len(reasons) == len(found):
-            raise CalibrationError(f"{name}: 0 of the views show the board: {reasons[0]}")
-    lenses = [calibrate_lens([corners for frame in found if not isinstance(corners := frame.corners[number], str)], request.board,
-                             request.square_m, size, name) for number, (size, name) in enumerate(named)]
-    shared = [[view for frame in found if (view := _shared(frame, number, request)) is not None] for number in range(1, len(named))]
-    poses = [calibrate_pose(views, request.board, request.square_m, lenses[0], lens, capture.camera.resolution, other.name)
-             for views, lens, other in zip(shared, lenses[1:], cameras, strict=True)]
+    named = [("the camera", capture.camera.resolution), *((other.name, other.resolution) for other in capture.manifest.other_cameras)]
+    lens, others = calibrate(found, named, request.board, request.square_m)
     timings.close()
     paths = manifests_to_replace(targets, manifest_paths)
-    return _write(request, targets, paths, lenses, poses, shared)
+    return _write(request, targets, paths, lens, others)
 
 
 def _check_cameras(target: Capture, capture: Capture) -> None:
@@ -174,50 +152,41 @@ def _check_cameras(target: Capture, capture: Capture) -> None:
                             "for the same cameras")
 
 
-def _shared(frame: BoardFrame, number: int, request: StereoRequest) -> SharedView | None:
-    """Return the corners of a frame that the first camera and another one see; None where these are too few."""
-    first, theirs = frame.corners[0], frame.corners[number]
-    if isinstance(first, str) or isinstance(theirs, str):
-        return None
-    if request.markers is None:
-        theirs = alike_order(first, theirs)
-    return SharedView(frame.name, first, theirs) if holds_a_pose(np.flatnonzero(_seen_by_both(first, theirs)), request.board) else None
-
-
 def _corners(capture: Capture, name: str, request: StereoRequest) -> np.ndarray | str:
     """Return the corners of the board in an image, or why there are none."""
     linear = linearise(capture.recorded_whole(name), capture.manifest.color_space)
     return find_board(linear @ np.array(GREY_WEIGHTS, np.float32), request.board, charuco_of(request))
 
 
-def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ...], lenses: list[Lens], poses: list[StereoPose],
-           shared: list[list[SharedView]]) -> StereoResult:
-    cameras = targets[0].manifest.other_cameras
+def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ...], lens: Lens,
+           others: list[OtherCalibration]) -> StereoResult:
+    names = [other.name for other in targets[0].manifest.other_cameras]
     rows: list[tuple[str, ...]] = []
     entries: list[dict[str, Any]] = []
-    for other, lens, pose, views in zip(cameras, lenses[1:], poses, shared, strict=True):
-        errors = list(zip(pose.first_error_px, pose.other_error_px, strict=True))
-        rows += [(view.name, other.name, f"{first:.3f}", f"{second:.3f}", "stands out" if max(first, second) > MOST_ERROR_PX else "")
-                 for view, (first, second) in zip(views, errors, strict=True)]
-        entries.append({"name": other.name, **lens_facts(lens), "rms_px": float(f"{pose.rms_px:.4g}"), "baseline_m": _baseline(pose),
-                        "views": [{"frame": view.name, "camera_px": float(f"{first:.4g}"), "other_px": float(f"{second:.4g}")}
-                                  for view, (first, second) in zip(views, errors, strict=True)]})
-    section = {"capture": str(request.capture), "camera": lens_facts(lenses[0]), "other_cameras": entries}
-    reports = [write_results("stereo", request, _updated(target.manifest, lenses, poses), path, section)
+    for name, other in zip(names, others, strict=True):
+        rows += [(frame, name, f"{first:.3f}", f"{second:.3f}", "stands out" if max(first, second) > MOST_ERROR_PX else "")
+                 for frame, first, second in other.views]
+        entries.append({"name": name, **lens_facts(other.lens), "rms_px": float(f"{other.rms_px:.4g}"), "baseline_m": _baseline(other),
+                        "sigma": other.certainty.facts(),
+                        "views": [{"frame": frame, "camera_px": float(f"{first:.4g}"), "other_px": float(f"{second:.4g}")}
+                                  for frame, first, second in other.views]})
+    section = {"capture": str(request.capture), "camera": lens_facts(lens), "other_cameras": entries}
+    reports = [write_results("stereo", request, _updated(target.manifest, lens, others), path, section)
                for target, path in zip(targets, paths, strict=True)]
-    summary = ", ".join(f"{other.name}: {pose.rms_px:.3f} px RMS, baseline {_baseline(pose):.4f} m"
-                        for other, pose in zip(cameras, poses, strict=True))
-    return StereoResult(paths, reports[0], rows, summary)
+    summary = ", ".join(f"{name}: {other.rms_px:.3f} px RMS, baseline {_baseline(other):.4f} m, "
+                        f"depths known to {100 * other.certainty.depth:.2g} %" for name, other in zip(names, others, strict=True))
+    warnings = [f"{name}: {said}" for name, other in zip(names, others, strict=True) for said in other.certainty.warnings()]
+    return StereoResult(paths, reports[0], rows, summary, warnings)
 
 
-def _baseline(pose: StereoPose) -> float:
-    return float(f"{np.linalg.norm(pose.camera_from_other[:3, 3]):.6g}")
+def _baseline(other: OtherCalibration) -> float:
+    return float(f"{np.linalg.norm(other.camera_from_other[:3, 3]):.6g}")
 
 
-def _updated(manifest: Manifest, lenses: list[Lens], poses: list[StereoPose]) -> Manifest:
+def _updated(manifest: Manifest, lens: Lens, others: list[OtherCalibration]) -> Manifest:
     """Return the manifest with all cameras."""
-    others = tuple(OtherCamera.model_validate({
-        "name": other.name, "resolution": other.resolution, "focal_px": lens.focal, "principal_px": lens.principal,
-        "distortion": lens.distortion, "camera_from_other": pose.camera_from_other.tolist()})
-        for other, lens, pose in zip(manifest.other_cameras, lenses[1:], poses, strict=True))
-    return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, lenses[0]), "other_cameras": others})
+    cameras = tuple(OtherCamera.model_validate({
+        "name": camera.name, "resolution": camera.resolution, "focal_px": other.lens.focal, "principal_px": other.lens.principal,
+        "distortion": other.lens.distortion, "camera_from_other": other.camera_from_other.tolist()})
+        for camera, other in zip(manifest.other_cameras, others, strict=True))
+    return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, lens), "other_cameras": cameras})

@@ -2,8 +2,7 @@
 
 A projector records no image, but the decoded patterns give the projector coordinates of each camera pixel. Near a corner of the board
 this map is a homography of the plane of the board; fitted to the decoded pixels around the corner it gives the corner in the
-projector with sub-pixel accuracy. With corners in both images, camera and projector are each calibrated by Zhang's method,
-then their relative pose.
+projector with sub-pixel accuracy. With corners in both images, both are calibrated as cameras are (bundle.py).
 
 Source: Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012 (local homographies);
     Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3.
@@ -18,6 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from service.calibrate.solvers.bundle import Certainty, Pinhole, Sight, adjust, alone
 from stage.capture.camera import Distortion
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import camera_from_projector, distortion_of
@@ -36,8 +36,6 @@ HOMOGRAPHY_PX = 2.0
 """A decoded pixel that lies farther from the homography, in projector pixels, is an outlier."""
 OUTLIER_FACTOR, OUTLIER_PX = 2.5, 0.5
 """A view is an outlier when its error exceeds this multiple of the median error, and this many pixels."""
-LENS_FLAGS = cv2.CALIB_FIX_K3
-"""k3 is kept at zero: without corners at the border of the image it would fit noise."""
 
 
 class BoardView(NamedTuple):
@@ -67,6 +65,7 @@ class ProCam(NamedTuple):
     camera_error_px: np.ndarray  # [views] root mean square of each view in the joint fit
     projector_error_px: np.ndarray  # [views] the same for the projector
     rms_px: float  # of camera and projector in the joint fit
+    certainty: Certainty
 
 
 def eight_bits(image: np.ndarray) -> np.ndarray:
@@ -139,26 +138,15 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     if len(views) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views)} of the views can be used: give {LEAST_VIEWS} or more, the board tilted differently in each")
     every = board_points(board, square_m)
-    objects = [every[view.kept] for view in views]
-    seen = [np.ascontiguousarray(view.camera, dtype=np.float32) for view in views]
-    lit = [np.ascontiguousarray(view.projector, dtype=np.float32) for view in views]
-    try:
-        camera_rms, camera_k, camera_d, _, _ = cv2.calibrateCamera(objects, seen, camera_size, None, None, flags=LENS_FLAGS)
-        projector_rms, projector_k, projector_d, _, _ = cv2.calibrateCamera(objects, lit, projector_size, None, None, flags=LENS_FLAGS)
-        stop = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9
-        rms, camera_k, camera_d, projector_k, projector_d, rotation, translation, _, _, _, _, errors = cv2.stereoCalibrateExtended(
-            objects, seen, lit, camera_k, camera_d, projector_k, projector_d, camera_size, np.eye(3), np.zeros((3, 1)),
-            flags=LENS_FLAGS | cv2.CALIB_USE_INTRINSIC_GUESS, criteria=stop)
-    except cv2.error as error:
-        raise CalibrationError(f"the poses of the board do not determine the devices ({str(error.err).strip().lower()}): "
-                               "tilt it differently from view to view") from error
-    pose = camera_from_projector(rotation, translation.ravel())
-    lenses = [lens_of(k, d, rms) for k, d, rms in ((camera_k, camera_d, camera_rms), (projector_k, projector_d, projector_rms))]
-    for lens, size, what in zip(lenses, (camera_size, projector_size), ("camera", "projector"), strict=True):
-        if not (np.isfinite(lens.focal).all() and 0.1 < max(lens.focal) / max(size) < 100):
-            raise CalibrationError(f"the focal length of the {what} comes out as {lens.focal[0]:.3g} px: the poses do not determine it, "
-                                   "tilt the board differently from view to view")
-    return ProCam(lenses[0], lenses[1], pose, errors[:, 0], errors[:, 1], float(rms))
+    sights = [[Sight(device, number, every[view.kept], (view.camera, view.projector)[device]) for number, view in enumerate(views)]
+              for device in (0, 1)]
+    devices = [alone(own, size, f"the {name}") for own, size, name in
+               zip(sights, (camera_size, projector_size), ("camera", "projector"), strict=True)]
+    found = adjust([*sights[0], *sights[1]], devices)
+    camera, projector = (lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True))
+    errors, lit = found.errors_px.reshape(2, len(views))
+    return ProCam(camera, projector, camera_from_projector(cv2.Rodrigues(found.places[1, :3])[0], found.places[1, 3:]), errors, lit,
+                  found.rms_px, found.certainty(1, "camera and projector"))
 
 
 def outliers(found: ProCam) -> np.ndarray:
@@ -172,6 +160,7 @@ def _spacing(grid: np.ndarray) -> float:
     return float(np.nanmedian(np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])))
 
 
-def lens_of(k: np.ndarray, d: np.ndarray, rms: float) -> Lens:
-    """Return a lens from OpenCV's camera matrix and distortion vector."""
-    return Lens((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2])), distortion_of(d), float(rms))
+def lens_of(lens: Pinhole, rms_px: float) -> Lens:
+    """Return a lens from OpenCV's. `rms_px`: of the device alone."""
+    (fx, _, cx), (_, fy, cy) = lens.matrix[:2]
+    return Lens((float(fx), float(fy)), (float(cx), float(cy)), distortion_of(lens.distortion), rms_px)

@@ -87,14 +87,16 @@ def _chart(result: Any) -> None:
 
 def _procam(result: Any) -> None:
     _print_files(result.manifest_paths, result.report_path)
-    print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m")
+    print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m, depths known to {100 * result.certainty.depth:.2g} %")
     print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
+    print_warnings(result.certainty.warnings())
 
 
 def _stereo(result: Any) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.summary}")
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
+    print_warnings(result.warnings)
 
 
 def _laser_planes(result: Any, request: LaserPlanesRequest) -> None:

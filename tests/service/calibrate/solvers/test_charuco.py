@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from service.calibrate.solvers.charuco import DICTIONARIES, Charuco, charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import board_points
-from service.calibrate.stereo import SharedView, calibrate_lens, calibrate_pose
+from service.calibrate.stereo import BoardFrame, calibrate
 from service.requests.calibrate import BoardOptions
 from stage.capture.capture import Capture
 from tests.reference import projector as reference
@@ -101,12 +101,12 @@ def test_corners_that_are_seen_are_right_and_the_others_left_out(views):
 
 def test_both_cameras_are_known_from_boards_seen_in_part(views):
     size = CAMERA.width, CAMERA.height
-    lenses = [calibrate_lens([view[number] for view in views], BOARD, SQUARE, size, "camera") for number in (1, 2)]
-    for lens, device in zip(lenses, (CAMERA, OTHER), strict=True):
-        assert np.abs(np.array(lens.focal) / device.focal - 1).max() < 0.01  # as with rendered chessboards
-    pose = calibrate_pose([SharedView("", first, other) for _, first, other in views], BOARD, SQUARE, *lenses, size, "other")
-    assert np.linalg.norm(pose.camera_from_other[:3, 3] - PLACE[:3, 3]) < 0.003
-    assert pose.rms_px < SADDLE_PX
+    frames = [BoardFrame("", (first, other)) for _, first, other in views]
+    lens, (other,) = calibrate(frames, [("camera", size), ("other", size)], BOARD, SQUARE)
+    for found, device in zip((lens, other.lens), (CAMERA, OTHER), strict=True):
+        assert np.abs(np.array(found.focal) / device.focal - 1).max() < 0.01  # as with rendered chessboards
+    assert np.linalg.norm(other.camera_from_other[:3, 3] - PLACE[:3, 3]) < 0.003
+    assert other.rms_px < SADDLE_PX
 
 
 def test_an_occluder_costs_its_corners_alone():

@@ -1,0 +1,220 @@
+"""Cameras and projectors that see the same boards, fitted to the corners of all views at once, and how sure that is.
+
+That corners fit says little: boards that all lie alike are explained as well by another focal length and other distances. The covariance of
+all parameters, those of the poses of the boards among them, tells by how much depths may be off.
+
+Source: Hartley and Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed. 2004, chapter 5 for the covariance of an estimate, and
+    chapter 18 for the adjustment of bundles; Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3, for
+    the start, and for the parallel poses that leave a lens open.
+
+Convention: the axes of OpenCV, y down, z forward.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stage.errors import CalibrationError
+
+LENS, POSE = 8, 6
+"""Parameters of a lens (focal lengths, principal point, k1, k2, p1, p2), and of a pose (rotation vector and translation)."""
+DOUBTED, REFUSED = 0.01, 0.03
+"""Standard deviation of depths, as a part of them, from which a calibration is remarked on, and from which it is none: beyond it another
+focal length far away fits as well, which the covariance does not tell."""
+MOST_STEPS = 100
+"""Evaluations after which a fit ends: where the boards determine the devices a dozen are enough."""
+TILT = "tilt the board by 30° or more, to another side in each view, and bring it nearer and farther"
+
+
+class Pinhole(NamedTuple):
+    """A lens as OpenCV has it."""
+
+    matrix: np.ndarray  # [3, 3]
+    distortion: np.ndarray  # [k1, k2, p1, p2]
+
+
+class Sight(NamedTuple):
+    """The corners of the board of one view, as one device sees them."""
+
+    device: int
+    view: int
+    board: np.ndarray  # [corners, 3] in the frame of the board
+    corners: np.ndarray  # [corners, 2]
+
+
+class Alone(NamedTuple):
+    """A device that was calibrated from its own sights alone."""
+
+    lens: Pinhole
+    boards: dict[int, np.ndarray]
+    """Of each view that it sees, rotation vector and translation [6] from the board to the device."""
+    rms_px: float
+
+
+class Certainty(NamedTuple):
+    """Standard deviations of two devices, and of the depths that are triangulated with both."""
+
+    focal: tuple[float, float]
+    """Of the focal length of each device, as a part of it."""
+    principal_px: tuple[float, float]
+    """Of the principal point of each device."""
+    depth: float
+    """Of depths where the board was, as a part of them: root mean square over its corners."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return the standard deviations as the report has them."""
+        return {"depth": float(f"{self.depth:.3g}"), "focal": [float(f"{part:.3g}") for part in self.focal],
+                "principal_px": [float(f"{pixels:.3g}") for pixels in self.principal_px]}
+
+    def warnings(self) -> list[str]:
+        """Return what there is to say of depths that are not sure."""
+        return [f"depths are known to {100 * self.depth:.2g} % alone: {TILT}"] if self.depth > DOUBTED else []
+
+
+class Bundle(NamedTuple):
+    """Devices and boards that explain all corners best."""
+
+    sights: list[Sight]
+    lenses: list[Pinhole]
+    places: np.ndarray  # [devices, 6] rotation vector and translation from the first device to each, zeros for the first
+    boards: dict[int, np.ndarray]
+    """Of each view, rotation vector and translation [6] from the board to the first device."""
+    errors_px: np.ndarray  # [sights] root mean square
+    covariance: np.ndarray  # of the parameters of all lenses and then of all places but the first
+
+    @property
+    def rms_px(self) -> float:
+        """Return the root mean square of all corners."""
+        return float(np.sqrt(np.average(self.errors_px**2, weights=[len(sight.board) for sight in self.sights])))
+
+    def certainty(self, device: int, name: str) -> Certainty:
+        """Return how sure a device and the first one are. Raises CalibrationError: the poses of the board leave depths open."""
+        own = np.r_[:LENS, LENS * device:LENS * (device + 1), LENS * len(self.lenses) + POSE * (device - 1) + np.arange(POSE)]
+        covariance = self.covariance[np.ix_(own, own)]
+        seen = {sight.view for sight in self.sights if sight.device == device}
+        slopes = np.concatenate([self._depth_slopes(sight, device) for sight in self.sights if not sight.device and sight.view in seen])
+        depth = float(np.sqrt(np.einsum("ni,ij,nj->n", slopes, covariance, slopes).mean()))
+        if not depth < REFUSED:  # nor is it when it is no number
+            known = f"depths would be known to {100 * depth:.2g} % alone" if depth < 1 else "depths would be unknown"
+            raise CalibrationError(f"the poses of the board do not determine {name}: {known}: {TILT}")
+        sigma = np.sqrt(np.diag(covariance)[:2 * LENS]).reshape(2, LENS)
+        focal = [float((sigma[index, :2] / np.diag(self.lenses[of].matrix)[:2]).max()) for index, of in enumerate((0, device))]
+        return Certainty((focal[0], focal[1]), (float(sigma[0, 2:4].max()), float(sigma[1, 2:4].max())), depth)
+
+    def _depth_slopes(self, sight: Sight, device: int) -> np.ndarray:
+        """Return by which part the depth of each corner changes with lens, other lens and place, [corners, 22], what is seen being held."""
+        count = len(sight.board)
+        turn, shift = self.boards[sight.view][:3], self.boards[sight.view][3:]
+        points = sight.board @ cv2.Rodrigues(turn)[0].T + shift
+        place = self.places[device]
+        by_first, by_second = (cv2.projectPoints(points, pose[:3], pose[3:], *lens)[1].reshape(count, 2, -1) for pose, lens in (
+            (np.zeros(POSE), self.lenses[0]), (place, self.lenses[device])))
+        here, there = by_first[..., 3:POSE], by_second[..., 3:POSE] @ cv2.Rodrigues(place[:3])[0]  # by the place of the corner
+        way = np.einsum("nij,nj->ni", there, points)  # by the part of its depth, along the line of sight
+        aside = -np.linalg.solve(here[..., :2], by_first[..., POSE:POSE + LENS])  # of the corner at its depth
+        off = np.concatenate([there[..., :2] @ aside, by_second[..., POSE:POSE + LENS], by_second[..., :POSE]], axis=-1)
+        return np.asarray(-np.einsum("ni,nij->nj", way, off) / np.maximum((way**2).sum(axis=1), 1e-300)[:, None])
+
+
+def alone(sights: Sequence[Sight], size: tuple[int, int], name: str) -> Alone:
+    """Calibrate a device from its own sights, by Zhang's method. `size`: width and height in pixels."""
+    try:
+        rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+            [sight.board.astype(np.float32) for sight in sights], [sight.corners.astype(np.float32) for sight in sights], size, None, None,
+            flags=cv2.CALIB_FIX_K3)  # without corners at the border of the image k3 would fit noise
+    except cv2.error as error:
+        raise CalibrationError(f"the poses of the board do not determine {name} ({str(error.err).strip().lower()}): {TILT}") from error
+    focal = matrix[0, 0]
+    if not (np.isfinite(matrix).all() and 0.1 < max(focal, matrix[1, 1]) / max(size) < 100):
+        raise CalibrationError(f"the focal length of {name} comes out as {focal:.3g} px: the poses do not determine it: {TILT}")
+    boards = {sight.view: np.concatenate([turn.ravel(), shift.ravel()]) for sight, turn, shift in zip(sights, turns, shifts, strict=True)}
+    return Alone(Pinhole(matrix, distortion.ravel()[:4]), boards, float(rms))
+
+
+def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
+    """Fit lenses, places and boards to the corners of all sights. Each device shares a view or more with the first."""
+    places = [np.zeros(POSE), *(_place(devices[0], other) for other in devices[1:])]
+    views = sorted({sight.view for sight in sights})
+    boards = []
+    for view in views:
+        number, pose = next((number, device.boards[view]) for number, device in enumerate(devices) if view in device.boards)
+        back = _inverse(places[number])
+        boards.append(_after(pose, back))
+    start = np.concatenate([*(_values(device.lens) for device in devices), *places[1:], *boards])
+    shared = len(start) - POSE * len(views)
+
+    def parts(values: np.ndarray) -> tuple[list[Pinhole], np.ndarray, dict[int, np.ndarray]]:
+        lenses = [_lens(values[LENS * device:LENS * (device + 1)]) for device in range(len(devices))]
+        places = np.concatenate([np.zeros(POSE), values[LENS * len(devices):shared]]).reshape(-1, POSE)
+        return lenses, places, dict(zip(views, values[shared:].reshape(-1, POSE), strict=True))
+
+    def shown(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much all corners are off, [2 corners of all sights], and the slopes by all parameters."""
+        lenses, places, boards = parts(values)
+        offs, rows = [], []
+        for sight in sights:
+            board, place = boards[sight.view], places[sight.device]
+            moved = cv2.composeRT(board[:3], board[3:], place[:3], place[3:])  # with derivatives by the four
+            seen, by = cv2.projectPoints(sight.board.astype(np.float64), *moved[:2], *lenses[sight.device])
+            by_board, by_place = (np.block([[moved[2 + of], moved[3 + of]], [moved[6 + of], moved[7 + of]]]) for of in (0, 2))
+            row = np.zeros((2 * len(sight.board), len(start)))
+            row[:, LENS * sight.device:LENS * (sight.device + 1)] = by[:, POSE:POSE + LENS]
+            if sight.device:
+                first = LENS * len(devices) + POSE * (sight.device - 1)
+                row[:, first:first + POSE] = by[:, :POSE] @ by_place
+            first = shared + POSE * views.index(sight.view)
+            row[:, first:first + POSE] = by[:, :POSE] @ by_board
+            offs.append((seen.reshape(-1, 2) - sight.corners).ravel())
+            rows.append(row)
+        return np.concatenate(offs), np.concatenate(rows)
+
+    found = least_squares(lambda values: shown(values)[0], start, jac=lambda values: shown(values)[1], x_scale="jac", method="lm",
+                          max_nfev=MOST_STEPS).x
+    off, slopes = shown(found)
+    of_device = np.concatenate([np.full(2 * len(sight.board), sight.device) for sight in sights])
+    errors = np.split(off, np.cumsum([2 * len(sight.board) for sight in sights])[:-1])
+    return Bundle(list(sights), *parts(found), np.array([np.sqrt(2 * np.mean(error**2)) for error in errors]),
+                  _covariance(slopes, off, of_device)[:shared, :shared])
+
+
+def _covariance(slopes: np.ndarray, off: np.ndarray, of_device: np.ndarray) -> np.ndarray:
+    """Return the covariance of a fit by least squares, whose residuals differ from device to device; infinite where something is open."""
+    unit = 1 / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+    scaled = slopes * unit
+    try:
+        inverse = np.linalg.inv(scaled.T @ scaled)
+    except np.linalg.LinAlgError:
+        return np.full((len(unit), len(unit)), np.inf)
+    free = max(1 - len(unit) / len(off), 1 / len(off))
+    owns = [of_device == device for device in np.unique(of_device)]
+    spread = sum(scaled[own].T @ scaled[own] * np.mean(off[own]**2) / free for own in owns)
+    return np.asarray(inverse @ spread @ inverse * unit * unit[:, None])
+
+
+def _place(first: Alone, other: Alone) -> np.ndarray:
+    """Return a pose from the first device to another one, from the boards that both see."""
+    poses = np.array([_after(_inverse(first.boards[view]), other.boards[view]) for view in first.boards.keys() & other.boards.keys()])
+    return np.concatenate([Rotation.from_rotvec(poses[:, :3]).mean().as_rotvec(), np.median(poses[:, 3:], axis=0)])
+
+
+def _after(pose: np.ndarray, then: np.ndarray) -> np.ndarray:
+    """Return a pose and then another one, each [6]."""
+    return np.concatenate([part.ravel() for part in cv2.composeRT(pose[:3], pose[3:], then[:3], then[3:])[:2]])
+
+
+def _inverse(pose: np.ndarray) -> np.ndarray:
+    back = -pose[:3]
+    return np.concatenate([back, -Rotation.from_rotvec(back).apply(pose[3:])])
+
+
+def _values(lens: Pinhole) -> np.ndarray:
+    """Return the parameters of a lens, [LENS]."""
+    return np.concatenate([np.diag(lens.matrix)[:2], lens.matrix[:2, 2], lens.distortion])
+
+
+def _lens(values: np.ndarray) -> Pinhole:
+    return Pinhole(np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]]), values[4:])
