@@ -9,10 +9,10 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from service.calibrate.results import LightCaptures, digits
 from service.calibrate.solvers.apply import LitFrame, as_direction
-from service.calibrate.solvers.ball_search import find_outlines
+from service.calibrate.solvers.ball_search import find_outlines, outline_near
 from service.calibrate.solvers.mirror_ball import find_spot
 from service.errors import RequestError
-from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, project, view_ball
+from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, fit_circle, project, view_ball
 from service.light_estimation.grey_ball import fit_brightness, fit_direction
 from service.requests.calibrate import BallRequest
 from service.requests.rig import RigCalibrationRequest
@@ -35,6 +35,9 @@ GAMMA = 0.45
 """Exponent with which frames are shown, so that dark outlines count."""
 LEAST_FRAMES = 0.7
 """The part of the frames that must agree that an outline is that of the ball: some lights stand behind it."""
+SURE_SHARE, ASIDE_PX = 0.6, 1.5
+"""The part of the radii of an outline with which a ball that was named is compared, and by how much it may lie aside without a word: what
+stands around a mirror moves its outline by a pixel."""
 LEAST_MOVE = 0.05
 """The least standard deviation of the place of the spot over the frames, relative to the radius: the lamp of the room stands still."""
 GREY_RESIDUAL = 0.1
@@ -66,6 +69,27 @@ def balls_of(request: BallRequest | RigCalibrationRequest, camera: Camera, *, ex
     for path, (radius, z) in zip(request.masks, places[len(request.circles):], strict=True):
         found.append(_masked_ball(path, camera, radius, z))
     return found
+
+
+def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCaptures) -> tuple[list[Ball], list[str]]:
+    """Compare the balls that a request names with the outlines that the images show near them.
+    Returns the balls, as far off as they lie from these outlines, and a sentence for each that lies aside."""
+    names = [*(f"--ball {circle.u:g},{circle.v:g},{circle.radius_px:g}" for circle in request.circles),
+             *(f"--ball-mask {path}" for path in request.masks)]
+    camera, pictures = captures.source.camera, _pictures(captures, FRAMES)
+    result, said = [], []
+    for name, ball in zip(names, balls, strict=True):
+        outline = outline_near(camera, pictures, ball)
+        if outline is not None and outline.share > SURE_SHARE:
+            named, seen = ((*project(camera, each.centre), each.radius_px) for each in (ball, outline.ball))
+            aside = float(np.linalg.norm(np.subtract(named, seen)))
+            ball = ball._replace(outline_error_px=float(np.hypot(ball.outline_error_px, aside)))
+            if aside > ASIDE_PX:
+                (u, v), radius = fit_circle(outline.points)
+                said.append(f"{name}: lies {aside:.1f} px from the outline that the images show there, {u:.1f},{v:.1f},{radius:.1f}: what "
+                            "is measured is as much less sure; leave the ball out, or give that outline")
+        result.append(ball)
+    return result, said
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
@@ -169,12 +193,7 @@ def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float |
 def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
           z_m: float | None) -> _Found:
     camera, correction = captures.source.camera, Correction.of(captures.source)
-    mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
-    for lit in captures.lit:
-        grey = correction.apply(lit.frame).pixels.mean(axis=-1, dtype=np.float64)
-        shown = np.clip(grey / max(float(np.quantile(grey, WHITE)), 1e-12), 0, 1) ** GAMMA
-        mean += shown / len(captures.lit)
-        brightest = np.maximum(brightest, shown)
+    mean, brightest = _pictures(captures, len(captures.lit))
     outlines = find_outlines(camera, [mean, brightest])[:CANDIDATES]
     placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
     views = [view_ball(ball, camera) for _, ball in placed]
@@ -191,6 +210,19 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
         if is_ball(ball, view, frames):
             balls.append(ball)
     return _Found(balls, len(outlines))
+
+
+def _pictures(captures: LightCaptures, most: int) -> list[np.ndarray]:
+    """Return the mean and the brightest of frames, [rows, cols] 0 to 1, as outlines are looked for. `most`: how many frames, at most."""
+    camera, correction = captures.source.camera, Correction.of(captures.source)
+    mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
+    chosen = evenly(len(captures.lit), most)
+    for number in chosen:
+        grey = correction.apply(captures.lit[number].frame).pixels.mean(axis=-1, dtype=np.float64)
+        shown = np.clip(grey / max(float(np.quantile(grey, WHITE)), 1e-12), 0, 1) ** GAMMA
+        mean += shown / len(chosen)
+        brightest = np.maximum(brightest, shown)
+    return [mean, brightest]
 
 
 def _only(captures: LightCaptures, kind: str, found: _Found) -> Ball:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.balls import ball_entry, balls_of, check_metric, find_grey_ball, find_mirror_ball, find_mirror_balls
+from service.calibrate.balls import ball_entry, balls_of, check_metric, compared, find_grey_ball, find_mirror_ball, find_mirror_balls
 from service.calibrate.results import (
     LightCalibration,
     LightCaptures,
@@ -49,8 +49,9 @@ class BallPixels(NamedTuple):
 def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the directions of distant lights from the bright spot on one mirror ball."""
     captures, timings = open_captures(request, progress)
+    warnings: list[str] = []
     if request.circles or request.masks:
-        (ball,) = balls_of(request, captures.source.camera, exactly=1)
+        (ball,), warnings = compared(request, balls_of(request, captures.source.camera, exactly=1), captures)
     else:
         ball = find_mirror_ball(captures, request.level)
     view = view_ball(ball, captures.source.camera)
@@ -70,7 +71,7 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()
     return write_lights("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
-                        summary={"balls": [ball_entry(ball)]})
+                        summary={"balls": [ball_entry(ball)]}, warnings=warnings)
 
 
 def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> LightCalibration:
@@ -81,6 +82,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
     balls = (balls_of(request, camera, at_least=2, radii=request.ball_radius_m, heights=request.ball_z_m) if named
              else _balls_in_sight(request, captures))
     check_metric(captures.source, balls, request.ball_radius_m)
+    balls, warnings = compared(request, balls, captures) if named else (balls, [])
     views = [view_ball(ball, camera) for ball in balls]
     middle = np.mean([ball.centre for ball in balls], axis=0)
     targets = _targets(captures)
@@ -108,7 +110,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
                                f"in {missed} of {len(results)} frames: not all of them are mirror balls of this size; name the balls with "
                                "--ball U,V,R or --ball-mask FILE")
     return write_lights("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
-                        summary={"balls": [ball_entry(ball) for ball in balls]})
+                        summary={"balls": [ball_entry(ball) for ball in balls]}, warnings=warnings)
 
 
 def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures) -> list[Ball]:
@@ -128,9 +130,11 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     """Measure the irradiance or intensity of each light from the shading of one grey ball."""
     captures, timings = open_captures(request, progress)
     camera = captures.source.camera
+    warnings: list[str] = []
     if request.circles or request.masks:
-        (ball,) = balls_of(request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),
-                         heights=() if request.ball_z_m is None else (request.ball_z_m,))
+        (ball,), warnings = compared(request, balls_of(
+            request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),
+            heights=() if request.ball_z_m is None else (request.ball_z_m,)), captures)
     else:
         level = camera.surface_z_m if camera.projection == "orthographic" else None
         ball = find_grey_ball(captures, request.ball_radius_m, level if request.ball_z_m is None else request.ball_z_m)
@@ -149,7 +153,9 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
         if request.refine_direction:
             shading = fit_direction(patch.radiance, patch.saturated, view)
             light = as_direction(light, shading.direction)
-            entry = {"direction": digits(shading.direction), "uncertainty_degrees": round(shading.uncertainty_degrees, 4)}
+            turned = np.degrees(ball.outline_error_px / ball.radius_px)  # normals are, and the direction with them
+            sure_to = float(np.hypot(shading.uncertainty_degrees, turned))
+            entry = {"direction": digits(shading.direction), "uncertainty_degrees": round(sure_to, 4)}
         found = fit_brightness(patch.radiance, patch.saturated, light, view)
         declared = captures.source.manifest.color_space
         other = better_encoding(patch.radiance, patch.saturated, light, view, exposure=lit.frame.exposure_s or 1.0, declared=declared,
@@ -165,7 +171,8 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()
     return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
-                        headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None)
+                        headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None,
+                        warnings=warnings)
 
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],

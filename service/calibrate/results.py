@@ -33,6 +33,7 @@ class LightCalibration(NamedTuple):
     rows: list[tuple[str, ...]]
     """One row for each measured light, the least certain first."""
     summary: str
+    warnings: list[str]
 
 
 class LightCaptures(NamedTuple):
@@ -107,6 +108,7 @@ def write_lights(
     headings: tuple[str, ...],  # of the table, between frame and flags
     summary: dict[str, Any],  # what the report says beside the lights
     relative: bool | None = None,  # whether the common scale of the measured lights is unknown; None: their strength was not measured
+    warnings: Sequence[str] = (),  # what there is to say of all lights
 ) -> LightCalibration:
     """Write the report, then the manifest, each whole or not at all, and return what was written."""
     manifest = with_lights(captures.target, [result.light for result in results])
@@ -120,12 +122,12 @@ def write_lights(
     flagged = sum(bool(result.entry["flags"]) for _, result in measured)
     report = write_results(kind, request, manifest, captures.manifest_path, {
         "capture": str(captures.source.folder), "applied_to": str(captures.target.folder),
-        "measured": len(measured), "dropped": dropped, "flagged": flagged, **summary, "lights": lights})
+        "measured": len(measured), "dropped": dropped, "flagged": flagged, "warnings": list(warnings), **summary, "lights": lights})
     measured.sort(key=lambda pair: pair[1].doubt, reverse=True)
     rows = [(lit.frame.image, *result.row, ", ".join(result.entry["flags"])) for lit, result in measured]
     counts = (len(measured), "measured"), (dropped, "left out"), (flagged, "flagged")
     text = ", ".join(f"{count} {what}" for count, what in counts if count)
-    return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text)
+    return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text, list(warnings))
 
 
 def write_results(kind: str, request: Options, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:

@@ -81,6 +81,11 @@ def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutli
     return distinct
 
 
+def outline_near(camera: Camera, pictures: list[np.ndarray], ball: Ball) -> RoundOutline | None:
+    """Return the outline that images show near a ball that was named, None where they show none."""
+    return _examine(camera, pictures, *project(camera, ball.centre), ball.radius_px)
+
+
 def _proposals(picture: np.ndarray) -> list[tuple[float, float, float]]:
     """Return centres and radii of circles, in pixels of the picture."""
     scale = min(1.0, SEARCH_SIZE / max(picture.shape))

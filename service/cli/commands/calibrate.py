@@ -142,6 +142,7 @@ def _print_lights(result: "LightCalibration") -> None:
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
+    print_warnings(result.warnings)
 
 
 def _print_image(name: str, result: "ImageCalibration") -> None:

@@ -161,3 +161,22 @@ def test_one_ball_does_not_place_lights(tmp_path):
     with pytest.raises(RequestError, match=r"1 mirror ball is found in the images .* near lights need two"):
         light_positions(LightPositionsRequest(capture=folder))
     assert files_in(folder) == before
+
+
+@pytest.mark.parametrize(("camera", "kind", "circle"), [
+    ("orthographic", "mirror", "115.7,100.2,59"), pytest.param("perspective", "grey", "78.8,84.8,60.7", marks=pytest.mark.long)])
+def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp_path, camera, kind, circle):
+    """Without it the directions of the mirror were 7° off, where 1° was stated."""
+    shade = chrome if kind == "mirror" else lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0)
+    folder = photograph(tmp_path / "capture", camera, shade)
+    outcome = relit.done("calibrate", f"{kind}-ball", folder, "--ball", circle, *(["--refine-direction"] if kind == "grey" else []))
+    report = json.loads((folder / "calibration.json").read_text())[f"{kind}-ball"]
+    sentence, = report["warnings"]
+    assert sentence in outcome.out.replace("\n", " ") and "px from the outline" in sentence
+    stated = np.array([light["uncertainty_degrees"] for light in report["lights"]])
+    error = angles_degrees(measured(folder), DIRECTIONS)
+    assert error.mean() > 3 and (error / stated).max() < 2.5 and np.median(error / stated) < 1.5
+    u, v, radius = map(float, sentence.split("there, ")[1].split(":")[0].split(","))
+    relit.done("calibrate", f"{kind}-ball", folder, "--ball", f"{u},{v},{radius}", *(["--refine-direction"] if kind == "grey" else []))
+    assert angles_degrees(measured(folder), DIRECTIONS).mean() < 0.25 * error.mean()
+    assert json.loads((folder / "calibration.json").read_text())[f"{kind}-ball"]["warnings"] == []
