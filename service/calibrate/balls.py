@@ -35,9 +35,8 @@ GAMMA = 0.45
 """Exponent with which frames are shown, so that dark outlines count."""
 LEAST_FRAMES = 0.7
 """The part of the frames that must agree that an outline is that of the ball: some lights stand behind it."""
-SURE_SHARE, ASIDE_PX = 0.6, 1.5
-"""The part of the radii of an outline with which a ball that was named is compared, and by how much it may lie aside without a word: what
-stands around a mirror moves its outline by a pixel."""
+ASIDE_PX = 1.5
+"""How far a named ball may lie from the outline in the images without a word, which what stands around a mirror moves by a pixel."""
 LEAST_MOVE = 0.05
 """The least standard deviation of the place of the spot over the frames, relative to the radius: the lamp of the room stands still."""
 GREY_RESIDUAL = 0.1
@@ -80,7 +79,7 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
     result, said = [], []
     for name, ball in zip(names, balls, strict=True):
         outline = outline_near(camera, pictures, ball)
-        if outline is not None and outline.share > SURE_SHARE:
+        if outline is not None:
             named, seen = ((*project(camera, each.centre), each.radius_px) for each in (ball, outline.ball))
             aside = float(np.linalg.norm(np.subtract(named, seen)))
             ball = ball._replace(outline_error_px=float(np.hypot(ball.outline_error_px, aside)))
