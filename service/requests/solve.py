@@ -42,7 +42,7 @@ class LightsKnown(Choice):
     """How far a solve trusts the lights of the manifest."""
 
     DECLARED = "declared", "the lights of the manifest"
-    REFINED = "refined", "the lights of the manifest, whose directions are only rough and are refined by the images"
+    REFINED = "refined", "the lights of the manifest: directions that are only rough, or a rig that stands elsewhere, refined by the images"
     UNKNOWN = "unknown", "distant lights that are found from the images; those of the manifest are placeholders"
 
 

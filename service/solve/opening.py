@@ -27,6 +27,7 @@ from stage.stack.ingest import open_stack
 from stage.stack.stack import Stack
 
 if TYPE_CHECKING:
+    from service.solve.lights.placement import RefinedPlaces
     from service.solve.lights.refined_lights import RefinedLights
     from service.solve.lights.unknown_lights import UnknownLights
 
@@ -46,7 +47,7 @@ class Opened(NamedTuple):
     given: SolveInput
     facts: dict[str, Any]
     """Facts about the lights for the report."""
-    found: "UnknownLights | RefinedLights | None" = None
+    found: "UnknownLights | RefinedLights | RefinedPlaces | None" = None
     """The way in which the lights were found, where they are those of the images."""
     brighter: float = 1.0
     """The factor by which the lights of the solve are brighter than those of the manifest, whose common factor is not known."""
@@ -134,14 +135,19 @@ def _default_method(capture: Capture, *, unknown: bool) -> Method:
     return next(method for method, entry in METHODS.items() if entry.is_default(capture))
 
 
-def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":
+def _find_lights(known: LightsKnown, given: SolveInput, lights: Any,
+                 capture: Capture) -> "UnknownLights | RefinedLights | RefinedPlaces":
     """Return the lights that the images ask for; their kernels and methods are imported for captures that need them."""
     if known is LightsKnown.UNKNOWN:
         from service.solve.lights.unknown_lights import find_lights
 
         return find_lights(given)
+    if isinstance(lights, PlacedLights):
+        from service.solve.lights.placement import refine_places
+
+        return refine_places(given, capture, lights)
     if not isinstance(lights, DistantLights):
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant lights alone")
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant and near lights alone")
     from service.solve.lights.refined_lights import refine_lights
 
     return refine_lights(given, lights)

@@ -32,6 +32,16 @@ class PlacedLights(NamedTuple):
     lobe: np.ndarray  # [lights, 4] float64: unit axis and exponent μ; 0 for a light that is equal in all directions
     centre: np.ndarray  # [3] float64, the centre of the object: mean of the masked pixels at its mean z
 
+    @classmethod
+    def about(cls, centre: np.ndarray, place: np.ndarray, strength: np.ndarray, lobe: np.ndarray) -> "PlacedLights":
+        """Return lights with their directions and irradiance at the centre of an object."""
+        way = place[:, :3] - place[:, 3:] * centre
+        distance = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+        direction = way / distance
+        falloff = np.where(place[:, 3:] == 1, 1 / distance**2, 1.0)
+        shining = np.maximum(-(lobe[:, :3] * direction).sum(axis=1, keepdims=True), 0) ** lobe[:, 3:]  # 0 to the power 0 is 1
+        return cls(direction, strength * falloff * shining, place, strength, lobe, centre)
+
 
 class LightPlaces(NamedTuple):
     """Positions and irradiance of distant and point lights, one row for each frame, as `PlacedLights` has it."""
@@ -89,12 +99,7 @@ def place_lights(capture: Capture) -> PlacedLights:
     centre = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask].mean(axis=0, dtype=np.float64)
     _check_places(frames, place, camera, mask, str(where))
     check_pairs(capture, place)
-    way = place[:, :3] - place[:, 3:] * centre
-    distance = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-    direction = way / distance
-    falloff = np.where(place[:, 3:] == 1, 1 / distance**2, 1.0)
-    shining = np.maximum(-(lobe[:, :3] * direction).sum(axis=1, keepdims=True), 0) ** lobe[:, 3:]  # 0 to the power 0 is 1
-    return PlacedLights(direction, strength * falloff * shining, place, strength, lobe, centre)
+    return PlacedLights.about(centre, place, strength, lobe)
 
 
 def _check_places(frames: tuple[int, ...], place: np.ndarray, camera: Camera, mask: np.ndarray, where: str) -> None:

@@ -20,7 +20,7 @@ from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, br
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.manifest import FILE_NAME
-from stage.capture.point_lights import light_places
+from stage.capture.point_lights import LightPlaces, PlacedLights, light_places
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import ManifestError
 from stage.spread import MAD_TO_SIGMA
@@ -96,7 +96,11 @@ class NearFit(NamedTuple):
     lit: np.ndarray  # [lights, pixels] bool: readings that are compared, the same wherever the points are
 
 
-class _Sample(NamedTuple):
+class NearSample(NamedTuple):
+    """Pixels on a grid over an object, and what is known of them."""
+
+    row: np.ndarray  # [rows] int, rows of the image
+    col: np.ndarray  # [cols] int
     mask: np.ndarray  # [rows, cols] bool
     x: np.ndarray  # [rows, cols] slopes of the lines of sight
     y: np.ndarray
@@ -106,6 +110,10 @@ class _Sample(NamedTuple):
     perspective: bool
     top: float
     """The z from which depths count: 0, or that of the light nearest to an orthographic camera."""
+
+    def pixels(self, width: int) -> np.ndarray:
+        """Return the numbers of the pixels of the mask in an image of this width, [pixels]."""
+        return np.asarray((self.row[:, None] * width + self.col)[self.mask])
 
     def points(self, height: np.ndarray) -> np.ndarray:
         """Return the points of the pixels at these z, [rows, cols, 3] metres."""
@@ -141,7 +149,7 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
                       "frame")
     depths = np.geomspace(NEAREST * span, FARTHEST * span, TRIALS)
     costs: dict[float, np.ndarray] = {}
-    sample = _sample(capture, stack)
+    sample = near_sample(capture, stack, light_places(capture))
     usable = sample.usable.sum(axis=0) >= LEAST_LIT
     if usable.sum() < LEAST_PIXELS:
         raise NotTold(f"{where} do not tell it: {int(usable.sum())} of the pixels that were looked at have {LEAST_LIT} "
@@ -162,7 +170,7 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
     if best < NEAREST * span * APART or best > FARTHEST * span / APART:
         raise NotTold(f"{where} do not tell it: they fit best at {sample.top - best:.3g} m, at the {'near' if best < span else 'far'} end "
                       "of what was tried: check positions and intensities of the lights, or measure the mean z of the object")
-    square = _squares(sample.mask)
+    square = squares_of(sample.mask)
     chosen = [number for number in np.unique(square) if (square == number).any()]
     logarithm = _lowest(tried, table.mean(axis=1))
     others = np.array([_lowest(tried, table[:, square != number].mean(axis=1)) for number in chosen])
@@ -181,7 +189,7 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
         raise NotTold(f"{where} hardly tell it: {sample.top - depth:.3g} m explains them best, with a standard error of "
                             f"{100 * sigma:.0f} % of the depth or more: measure the mean z of the object in the camera frame")
     sigma_m = sigma * depth
-    here, off = (_surface(sample, depth * factor, device).normal for factor in (1.0, 1.0 + sigma))
+    here, off = (surface_at(sample, depth * factor, device).normal for factor in (1.0, 1.0 + sigma))
     turned = float(np.degrees(np.median(np.arccos(np.clip((here * off).sum(axis=0), -1, 1)))))
     z = sample.top - depth
     facts = {"surface_z_m": float(f"{z:.6g}"), "sigma_m": float(f"{sigma_m:.3g}"),
@@ -197,7 +205,8 @@ def _span(capture: Capture) -> float:
     return float(np.linalg.norm(places[:, None] - places, axis=2).max())
 
 
-def _sample(capture: Capture, stack: Stack) -> _Sample:
+def near_sample(capture: Capture, stack: Stack, placed: LightPlaces | PlacedLights) -> NearSample:
+    """Return pixels that are evenly spread over the object, with the lights of the stack."""
     camera, mask = capture.camera, capture.mask()
     rows, cols = np.nonzero(mask)
     step = max(1, int(np.ceil((max(np.ptp(rows), np.ptp(cols)) + 1) / ACROSS)))
@@ -206,22 +215,25 @@ def _sample(capture: Capture, stack: Stack) -> _Sample:
     x, y = camera.plane_at(col + 0.5, row + 0.5)
     radiance, usable = stack.pick_radiance((row * camera.width + col)[inside])
     readings = np.einsum("lpc,c->lp", radiance.astype(np.float64), np.asarray(GREY_WEIGHTS))
-    placed = light_places(capture)
     perspective = camera.projection == "perspective"
     top = 0.0 if perspective else float(placed.place[placed.place[:, 3] == 1, 2].max())
-    return _Sample(inside, x, y, readings, usable, Lamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe),
-                   perspective, top)
+    lamps = Lamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe)
+    return NearSample(row[:, 0], col[0], inside, x, y, readings, usable, lamps, perspective, top)
 
 
-def _cost(sample: _Sample, depth: float, device: str) -> np.ndarray:
+def _cost(sample: NearSample, depth: float, device: str) -> np.ndarray:
     """Return the cost of each pixel, [pixels], of a surface with this mean depth."""
-    fit = _surface(sample, depth, device)
+    return cost_of(surface_at(sample, depth, device))
+
+
+def cost_of(fit: NearFit) -> np.ndarray:
+    """Return the cost of each pixel, [pixels]: the mean over its lit readings of ln(1 + (residual / noise)²)."""
     lit = fit.lit.sum(axis=0)
     cost = np.where(fit.lit, np.log1p((fit.residual / NOISE) ** 2), 0).sum(axis=0) / np.maximum(lit, 1)
     return np.where(lit >= LEAST_LIT, cost, np.log1p(1 / NOISE**2))
 
 
-def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
+def surface_at(sample: NearSample, depth: float, device: str) -> NearFit:
     """Return the normals of a surface with this mean depth, and what they leave."""
     mask, z, sight = sample.mask, sample.top - depth, sample.sight()
     fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(np.full(mask.shape, z))[mask])
@@ -239,7 +251,7 @@ def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
     return fit
 
 
-def _spread_by_lights(sample: _Sample, best: float, device: str) -> float:
+def _spread_by_lights(sample: NearSample, best: float, device: str) -> float:
     """Return the variance of the logarithm of the depth for the errors of the lights, by leaving out groups of them."""
     count = len(sample.readings)
     groups = np.arange(count) % min(GROUPS, count)
@@ -253,7 +265,7 @@ def _spread_by_lights(sample: _Sample, best: float, device: str) -> float:
     return float((len(found) - 1) / len(found) * ((np.array(found) - np.mean(found)) ** 2).sum())
 
 
-def _squares(mask: np.ndarray) -> np.ndarray:
+def squares_of(mask: np.ndarray) -> np.ndarray:
     """Return the number of the square that each pixel of a mask lies in, [pixels]."""
     row, col = np.nonzero(mask)
     return np.asarray(row * SQUARES // mask.shape[0] * SQUARES + col * SQUARES // mask.shape[1])

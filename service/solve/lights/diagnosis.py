@@ -25,6 +25,7 @@ from service.light_estimation.lambertian import SHADOW, median_of, normal_equati
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, raise_error, suspect_lights
 from service.solve.height.distance import NOISE, SQUARES, SURE, Lamps, NearFit, fit_near
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
+from service.solve.lights.placement import find_placement
 from stage.capture.capture import Capture
 from stage.capture.gradients import GradientFrames
 from stage.capture.lighting import ExtendedLights
@@ -114,6 +115,12 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
             raise_error(solution, other.degrees)
         if estimated:
             fit = fit_manifest(sample._replace(irradiance=lights.irradiance))
+    moved = find_placement(given, capture, lights) if isinstance(lights, PlacedLights) else None
+    if moved is not None:
+        solution.warnings.append(moved.sentence)
+        solution.facts["light_placement"] = {"moved_m": [float(f"{metres:.3g}") for metres in moved.moved_m],
+                                             "factor": float(f"{moved.factor:.4g}")}
+        raise_error(solution, moved.degrees)
     axes = find_axes(given, solution, lights if isinstance(lights, DistantLights) else None, fit)
     if axes is None:
         axes = find_inversion(given, solution, lights if isinstance(lights, DistantLights) else None)

@@ -7,7 +7,7 @@ import pytest
 
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
-from stage.errors import CalibrationError, ManifestError
+from stage.errors import CalibrationError
 from tests.scenes.captures import angles_degrees, edit_frame, make_scene, write_capture
 from tests.scenes.ellipsoid import ellipsoid
 
@@ -83,5 +83,5 @@ def test_what_cannot_be_refined_is_refused(tmp_path):
     folder = write_capture(tmp_path / "near", make_scene(24, 13), camera={"projection": "orthographic", "resolution": [24, 24],
                                                                           "pixel_size_m": 0.001})
     edit_frame(folder, 3, light={"type": "point", "position_m": [0, 0, 1], "intensity": [1, 1, 1]})
-    with pytest.raises(ManifestError, match="distant lights alone"):
+    with pytest.raises(CalibrationError, match="1 near lights do not tell where they stand"):
         solve(SolveRequest(capture=folder, out=tmp_path / "out", method="robust", lights="refined", device="cpu"))

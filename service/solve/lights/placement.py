@@ -1,0 +1,197 @@
+"""Whether near lights stand elsewhere than declared: all of them moved alike, or farther from or nearer to the origin by one factor.
+
+So rigs are misplaced: their origin is not that of the camera, the surface is not where it was said, or a scale is wrong. The normals take
+up a part, as a few degrees that all have in common; that light falls off over the object otherwise than it should is left at every pixel,
+and tells three lengths and the factor.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from service.solve.base.solution import SolveInput
+from service.solve.height.distance import (
+    LEAST_LIGHTS,
+    LEAST_PIXELS,
+    SQUARES,
+    SURE,
+    Lamps,
+    NearFit,
+    cost_of,
+    near_sample,
+    squares_of,
+    surface_at,
+)
+from service.solve.height.height import mean_height
+from stage.capture.capture import Capture
+from stage.capture.point_lights import PlacedLights
+from stage.errors import CalibrationError
+
+STEP = 0.05
+"""First step of the search, in the largest distance between two lights, and as a part of the factor."""
+PROBE, LEAST_SLOPE = 0.0125, 0.01
+"""Steps to either side that are tried before a search, and the least part of the cost that one of them must take away."""
+MOST_FITS, LENGTH, COST = 200, 2e-3, 1e-4
+"""Fits after which the search ends, and the lengths (in that distance) and costs that end it before."""
+LEAST_GAIN = 0.06
+"""Least part of the cost of the readings that other places take away. Where the declared ones are right it is up to 0.02, on gloss too."""
+QUIET = 0.01
+"""Cost that is added to what gains are parts of: that of a residual of a five hundredth, which rounding and a coarse grid leave."""
+MOST_MOVED, MOST_FACTOR = 2.0, 5.0
+"""Largest move in the distance between two lights, and largest factor or its inverse: farther ones make up for another fault."""
+NEIGHBOURS = 8
+"""Compared pixels from which the error of a pixel between them is taken."""
+
+
+class Placement(NamedTuple):
+    """Places of near lights that explain the images much better than the declared ones."""
+
+    sentence: str
+    moved_m: tuple[float, float, float]
+    factor: float
+    gain: float
+    """The part of the cost of the readings that they take away."""
+    degrees: np.ndarray  # [pixels of the image] float32, angle between the normals under these and under the declared; 0 outside the mask
+
+
+class RefinedPlaces(NamedTuple):
+    """Near lights that were moved together until they explain the images."""
+
+    lights: PlacedLights
+    left_degrees: np.ndarray  # [pixels of the image] float32, standard error of the normals for what the places have wrong
+    facts: dict[str, Any]
+    """Facts for the report."""
+    warnings: tuple[str, ...]
+
+    def doubt(self, normal: np.ndarray) -> np.ndarray:
+        """Return the standard error of normals [3, pixels] for what all places have wrong together, [pixels] degrees."""
+        return self.left_degrees
+
+
+class Move(NamedTuple):
+    """How near lights are moved together."""
+
+    values: np.ndarray  # [4] three lengths in the largest distance between two lights, and the logarithm of a factor
+    irradiance_holds: bool
+    """Whether their irradiance at the object is what was declared, as where it was measured there, and not their intensity."""
+
+    @property
+    def plausible(self) -> bool:
+        """Return whether so a rig may be misplaced."""
+        return bool(np.abs(self.values[:3]).max() < MOST_MOVED and abs(self.values[3]) < np.log(MOST_FACTOR))
+
+
+STAY = Move(np.zeros(4), irradiance_holds=False)
+
+
+class _Search:
+    """The search for the move of the near lights that explains the readings."""
+
+    def __init__(self, given: SolveInput, capture: Capture, lights: PlacedLights) -> None:
+        self.sample, self._device = near_sample(capture, given.stack, lights), given.device
+        self.near = lights.place[:, 3] == 1
+        places = lights.place[self.near, :3]
+        self.span = float(np.linalg.norm(places[:, None] - places, axis=2).max(initial=0))
+        self._depth = self.sample.top - mean_height(capture.camera)
+        self._centre = lights.centre
+
+    @property
+    def possible(self) -> bool:
+        """Return whether there are enough lights and readings to tell."""
+        told = self.sample.usable.sum(axis=0) >= LEAST_LIGHTS
+        return self.near.sum() >= LEAST_LIGHTS and told.sum() >= LEAST_PIXELS and self.span > 0
+
+    def moved(self, move: Move) -> Lamps:
+        """Return the lights that are moved."""
+        lamps = self.sample.lamps
+        place, strength = lamps.place.copy(), lamps.strength.copy()
+        place[self.near, :3] = place[self.near, :3] * np.exp(move.values[3]) + self.span * move.values[:3]
+        if move.irradiance_holds:
+            before, after = (((each[self.near, :3] - self._centre)**2).sum(axis=1) for each in (lamps.place, place))
+            strength[self.near] *= after / before
+        return lamps._replace(place=place, strength=strength)
+
+    def fit(self, move: Move) -> NearFit:
+        """Return the normals under lights that are moved, and what they leave."""
+        return surface_at(self.sample._replace(lamps=self.moved(move)), self._depth, self._device)
+
+    def best(self, counted: np.ndarray | None = None) -> Move:
+        """Return the move that leaves least. `counted`: [pixels] bool, whose readings count; None: all."""
+        start = np.vstack([np.zeros(4), STEP * np.eye(4)])
+        tried = []
+        for holds in (False, True):
+            def cost(values: np.ndarray, holds: bool = holds) -> float:
+                return float(cost_of(self.fit(Move(values, holds)))[slice(None) if counted is None else counted].mean())
+
+            found = minimize(cost, start[0], method="Nelder-Mead", options={
+                "initial_simplex": start, "maxfev": MOST_FITS, "xatol": LENGTH, "fatol": COST})
+            tried.append((float(found.fun), Move(found.x, holds)))
+        return min(tried, key=lambda one: one[0])[1]
+
+    def spread(self, of_samples: np.ndarray, given: SolveInput, capture: Capture) -> np.ndarray:
+        """Return what holds at the sampled pixels [pixels] at all pixels of the image: the root mean square of the nearest; 0 outside the
+        mask."""
+        width = capture.camera.width
+        sampled = self.sample.pixels(width)
+        inside = np.flatnonzero(given.mask)
+        _, nearest = cKDTree(np.stack(np.divmod(sampled, width), axis=1)).query(
+            np.stack(np.divmod(inside, width), axis=1), k=min(NEIGHBOURS, len(sampled)))
+        found = np.zeros(given.mask.size, np.float32)
+        found[inside] = np.sqrt((of_samples**2)[nearest].mean(axis=-1))
+        return found
+
+
+def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) -> Placement | None:
+    """Return where all near lights stand together, None where nothing speaks against the declared places."""
+    search = _Search(given, capture, lights)
+    if not search.possible:
+        return None
+    here = float(cost_of(search.fit(STAY)).mean()) + QUIET
+    steps = [Move(step, holds) for step in PROBE * np.vstack([np.eye(4), -np.eye(4)]) for holds in (False, True)]
+    if not any(here - QUIET - cost_of(search.fit(step)).mean() > LEAST_SLOPE * here for step in steps):
+        return None
+    found = search.best()
+    fits = [search.fit(move) for move in (STAY, found)]
+    before, after = (cost_of(fit) for fit in fits)
+    gain = float((before - after).mean()) / (float(before.mean()) + QUIET)
+    less = np.bincount(squares_of(search.sample.mask), weights=before - after)
+    if not found.plausible or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
+        return None
+    way, factor = search.span * found.values[:3], float(np.exp(found.values[3]))
+    words = ", ".join(f"{length:+.3f}" for length in way)
+    return Placement(
+        f"frames[].light.position_m: the near lights look moved by ({words}) m and {factor:.3g} times as far from the origin; the readings "
+        f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m and camera.pixel_size_m, or take "
+        "them as found (--lights refined)",
+        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.spread(_turned(*fits), given, capture))
+
+
+def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> RefinedPlaces:
+    """Move all near lights together until they explain the images. Raises CalibrationError: the images do not tell it."""
+    search = _Search(given, capture, lights)
+    if not search.possible:
+        raise CalibrationError(f"--lights refined: {int(search.near.sum())} near lights do not tell where they stand: {LEAST_LIGHTS} or "
+                               f"more are needed, and {LEAST_PIXELS} pixels that each are lit by as many")
+    found = search.best()
+    if not found.plausible:
+        raise CalibrationError("--lights refined: the images fit best under lights that stand somewhere else altogether: check "
+                               "frames[].light.position_m, their order and axes")
+    square = squares_of(search.sample.mask)
+    even = (square // SQUARES + square) % 2 == 0  # as on a chessboard
+    left = _turned(*(search.fit(search.best(own)) for own in (even, ~even)))  # twice what noise leaves, for what both halves share
+    lamps = search.moved(found)
+    ratio = lamps.strength / search.sample.lamps.strength
+    if not found.irradiance_holds:  # then as strong at the origin as before, on the whole
+        ratio = np.where(search.near, np.exp(2 * found.values[3]), 1.0)
+    facts = {"moved_m": [float(f"{metres:.4g}") for metres in search.span * found.values[:3]],
+             "factor": float(f"{np.exp(found.values[3]):.5g}"), "irradiance_holds": found.irradiance_holds,
+             "left_degrees": round(float(np.median(left)), 3)}
+    return RefinedPlaces(PlacedLights.about(lights.centre, lamps.place, lights.strength * ratio[:, None], lights.lobe),
+                         search.spread(left, given, capture), {"refined_lights": facts}, ())
+
+
+def _turned(one: NearFit, other: NearFit) -> np.ndarray:
+    """Return the angle between the normals of two fits, [pixels] degrees."""
+    return np.degrees(np.arccos(np.clip((one.normal * other.normal).sum(axis=0), -1, 1)))
