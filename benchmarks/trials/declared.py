@@ -1,4 +1,5 @@
-"""Lights and materials other than declared: lamps near the object, one of five lights of twice the strength, and velvet; right ones beside.
+"""Lights and materials other than declared: lamps near the object or elsewhere, one of five lights of twice the strength, and velvet; right
+ones beside.
 
 The scenes are an egg with waves on it and a field of random waves, in closed form, under lights on a spiral, with shot noise. Velvet is the
 inverted Gaussian of Ashikhmin, Premoze and Shirley, "A microfacet-based BRDF generator", SIGGRAPH 2000.
@@ -42,8 +43,16 @@ class Case:
     away: float | None = None
     """Distance of the lamps in half widths; None: they are far."""
     doubled: bool = False
+    near: bool = False
+    """Whether the lamps are declared as near ones, of which a half width is a tenth of a metre."""
+    aside_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """By how much near lamps are declared aside of where they stand."""
+    factor: float = 1.0
+    """How many times as far from the origin near lamps are declared."""
 
 
+HALF_M = 0.1
+"""Half width of an object under near lamps."""
 CASES = [
     Case("egg, 8 lamps 1.5 half widths away, declared distant", "egg", "matt", 8, away=1.5),
     Case("egg, gloss, 20 lamps 2 half widths away, declared distant", "egg", "gloss", 20, away=2.0),
@@ -52,6 +61,10 @@ CASES = [
     Case("field, gloss, one of 5 lights doubled", "field", "gloss", 5, doubled=True),
     Case("egg, velvet, 20 lights", "egg", "velvet", 20), Case("field, velvet, 12 lights", "field", "velvet", 12),
     Case("egg, gloss, 20 lights", "egg", "gloss", 20), Case("egg, 8 lights", "egg", "matt", 8),
+    Case("egg, 8 near lights", "egg", "matt", 8, away=2.5, near=True),
+    Case("egg, 8 near lights, declared 3 cm aside", "egg", "matt", 8, away=2.5, near=True, aside_m=(0.03, 0.0, 0.0)),
+    Case("field, 12 near lights, declared 1.3 times as far", "field", "matt", 12, away=4.0, near=True, factor=1.3),
+    Case("egg, gloss, 20 near lights, declared 4 cm too near", "egg", "gloss", 20, away=3.0, near=True, aside_m=(0.0, 0.0, -0.04)),
 ]
 
 
@@ -101,17 +114,23 @@ def write(folder: Path, case: Case, number: int) -> Surface:
         image[:] = found.albedo * reflect(case.material, found.normal, way / length[..., None]) * (1 if case.away is None else
                                                                                                   (case.away / length) ** 2)
     images[case.lights // 2] *= 2 if case.doubled else 1
-    images *= 0.9 / np.percentile(images, 99.9)
+    scale = 0.9 / np.percentile(images, 99.9)
+    images *= scale
     images += NOISE * np.sqrt(images + 0.01) * random.standard_normal(images.shape)
     frames = []
     for place, (image, direction) in enumerate(zip(np.clip(images, 0, 1) * found.mask, directions, strict=True)):
         write_grey(folder / f"{place:02d}.exr", image)
-        frames.append({"image": f"{place:02d}.exr", "light": {"type": "distant", "direction": direction.tolist(),
-                                                              "irradiance": [np.pi] * 3}})
+        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [np.pi] * 3}
+        if case.near:
+            away_m = case.factor * HALF_M * (case.away or 0.0)
+            light = {"type": "point", "position_m": (away_m * direction + case.aside_m).tolist(),
+                     "intensity": [np.pi * scale * away_m**2] * 3}
+        frames.append({"image": f"{place:02d}.exr", "light": light})
     write_grey(folder / "mask.exr", found.mask)
     (folder / "capture.json").write_text(json.dumps({
         "schema": "relit.capture/1", "name": "declared", "frames": frames, "mask": "mask.exr", "saturation": 0.999,
-        "irradiance_scale": "relative", "camera": {"projection": "orthographic", "resolution": [SIZE, SIZE]}}))
+        "irradiance_scale": "relative", "camera": {"projection": "orthographic", "resolution": [SIZE, SIZE],
+                                                   **({"pixel_size_m": 2 * HALF_M / SIZE, "surface_z_m": 0.0} if case.near else {})}}))
     return found
 
 
@@ -121,5 +140,6 @@ def trials(data: Path | None) -> Iterator[Trial]:
         with tempfile.TemporaryDirectory() as folder:
             truth = write(Path(folder), case, number)
             method = Method.SVBRDF if case.lights >= 12 else Method.ROBUST
-            right = case.away is None and not case.doubled and case.material != "velvet"
+            placed = case.away is None or (case.near and not any(case.aside_m) and case.factor == 1)
+            right = placed and not case.doubled and case.material != "velvet"
             yield trial(case.name, Path(folder), truth.normal, truth.mask, in_model=right, method=method)[0]

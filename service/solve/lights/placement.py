@@ -37,6 +37,8 @@ MOST_FITS, LENGTH, COST = 200, 2e-3, 1e-4
 """Fits after which the search ends, and the lengths (in that distance) and costs that end it before."""
 LEAST_GAIN = 0.06
 """Least part of the cost of the readings that other places take away. Where the declared ones are right it is up to 0.02, on gloss too."""
+DEVICE = "cpu"
+"""A grid of 32 × 32 pixels is solved some hundred times: a GPU would wait for the launches."""
 QUIET = 0.01
 """Cost that is added to what gains are parts of: that of a residual of a five hundredth, which rounding and a coarse grid leave."""
 MOST_MOVED, MOST_FACTOR = 2.0, 5.0
@@ -90,7 +92,7 @@ class _Search:
     """The search for the move of the near lights that explains the readings."""
 
     def __init__(self, given: SolveInput, capture: Capture, lights: PlacedLights) -> None:
-        self.sample, self._device = near_sample(capture, given.stack, lights), given.device
+        self.sample = near_sample(capture, given.stack, lights)
         self.near = lights.place[:, 3] == 1
         places = lights.place[self.near, :3]
         self.span = float(np.linalg.norm(places[:, None] - places, axis=2).max(initial=0))
@@ -115,7 +117,7 @@ class _Search:
 
     def fit(self, move: Move) -> NearFit:
         """Return the normals under lights that are moved, and what they leave."""
-        return surface_at(self.sample._replace(lamps=self.moved(move)), self._depth, self._device)
+        return surface_at(self.sample._replace(lamps=self.moved(move)), self._depth, DEVICE)
 
     def best(self, counted: np.ndarray | None = None) -> Move:
         """Return the move that leaves least. `counted`: [pixels] bool, whose readings count; None: all."""
