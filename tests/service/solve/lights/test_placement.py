@@ -51,8 +51,9 @@ def test_lights_that_are_moved_are_named_and_sigma_holds_it(relit, tmp_path, how
     assert np.abs(declared * found["factor"] + found["moved_m"] - back).max() < 0.01  # of 0.03 to 0.07 m: ripples are coarse on the grid
 
 
-@pytest.mark.parametrize("how", ["aside", *(pytest.param(how, marks=pytest.mark.long) for how in list(MOVED)[1:])])
-@pytest.mark.parametrize("on_a_ball", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("how", MOVED)
+@pytest.mark.parametrize("on_a_ball", [True, False])
 def test_lights_are_moved_back(relit, tmp_path, how, on_a_ball):
     """As good as under the right lights, but for what twelve lights leave open; whether their intensity was measured by itself, or at the
     object under lights that were thought to stand there."""
