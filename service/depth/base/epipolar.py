@@ -11,7 +11,7 @@ Source: MacKay, "Bayesian interpolation", Neural Computation 4, 1992, for the fa
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,8 +38,6 @@ ROUNDS = 24
 """Number of fits from which the factor of the errors is found, each with the weights of Cauchy and the factor that the one before gives."""
 LAST_ROUNDS = 6
 """Number of fits with that factor."""
-
-
 REFINEMENTS = 3
 """Largest number of times that a view is refined, each by what is triangulated with the one before."""
 
@@ -89,6 +87,11 @@ def difference(declared: Projector, found: Projector) -> str:
     poses = [np.array(each.camera_from_projector)[:3, :3] for each in (declared, found)]
     turn = float(np.degrees(Rotation.from_matrix(poses[0].T @ poses[1]).magnitude()))
     return f"as if it were turned by {turn:.2f}° from there and its focal_px {found.focal_px[0] / declared.focal_px[0]:.3f} times that"
+
+
+def view_facts(view: Projector, name: str, pose: object) -> dict[str, Any]:
+    """Return a view that was refined as the report has it: its lens, and its place under the name that a manifest gives it."""
+    return {"focal_px": view.focal_px, "principal_px": view.principal_px, name: pose}
 
 
 def _image(projector: Projector, q: np.ndarray) -> np.ndarray:

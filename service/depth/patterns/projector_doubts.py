@@ -3,7 +3,7 @@
 import numpy as np
 
 from kernels.status import SOLVED
-from service.depth.base.epipolar import Contradiction, contradiction, difference
+from service.depth.base.epipolar import Contradiction, contradiction, difference, view_facts
 from service.depth.base.solution import DepthSolution
 from service.depth.patterns.coordinates import AxisMaps
 from stage.capture.camera import Camera
@@ -36,8 +36,8 @@ def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, fou
     solution.sigma[:] = np.hypot(solution.sigma, more)
     solution.facts["contradiction_px"] = float(f"{found.size_px:.3g}")
     if found.declared is not declared:
-        solution.facts["refined_projector"] = found.declared.model_dump(
-            mode="json", include={"focal_px", "principal_px", "camera_from_projector"})
+        view = found.declared
+        solution.facts["refined_projector"] = view_facts(view, "camera_from_projector", view.camera_from_projector)
         solution.warnings.append(
             f"projector: columns and rows contradict its calibration, {difference(declared, found.declared)}: depths are those of a "
             f"projector that is ({found.noise_px:.2g} px are left), which found.refined_projector in report.json holds, and the standard "

@@ -10,7 +10,7 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.base.epipolar import Contradiction, settled
+from service.depth.base.epipolar import Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.frame_light import full_scale
@@ -81,52 +81,63 @@ class Matched(NamedTuple):
     disparity: Disparity
 
 
+class Measured(NamedTuple):
+    """What one other camera tells."""
+
+    depth: PairDepth
+    facts: dict[str, Any]
+    """Facts for the report."""
+    warnings: list[str]
+
+
 def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
     """Match the frames under texture and triangulate them; depths outside the request's span are OUT_OF_RANGE."""
     check_perspective(capture)
     frames = [frame for frame in capture.manifest.frames if frame.stereo is not None]
-    found: list[PairDepth] = []
-    facts: dict[str, Any] = {"frames": len(frames), "cameras": []}
-    warnings: list[str] = []
-    for index, other in enumerate(capture.manifest.other_cameras):
-        rectify(capture.camera, other, where=f"{capture.folder / FILE_NAME}: other_cameras[{index}]")  # checks it
-        given = as_projector(other, np.array(other.camera_from_other))
-
-        def measure(view: Projector, before: Contradiction | None, index: int = index, name: str = other.name) -> tuple[
-                Matched, Contradiction | None]:
-            matched = _matched(capture, frames, index, as_camera(view, name), request, device, timings)
-            return matched, contradicted(matched.disparity.offsets, matched.geometry, view, before)
-
-        view, matched, contradiction = settled(given, measure, refine=request.refine_projector)
-        geometry, disparity, offsets = matched.geometry, matched.disparity, matched.disparity.offsets
-        told: dict[str, Any] = {
-            "name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
-            "disparity_px": [_short(end + geometry.offset_px) for end in matched.span],
-            "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
-        if len(offsets.offset) >= ENOUGH:
-            told["row_offset_px"] = statistics(offsets.offset)
-        facts["cameras"].append(told)
-        pair = _triangulated(disparity, geometry, capture, request)
-        believed = contradiction is None or contradiction.plausible
-        if believed and by_chance(offsets):
-            believed = False
-            warnings.append(f"frames: the places that match in the images of {other.name} lie in neighbouring rows at random, as in images "
-                            "that have nothing to do with each other: no depth is trusted")
-        elif contradiction is not None:
-            told["contradiction_px"] = _short(contradiction.size_px)
-            if view is not given:
-                told["refined"] = as_camera(view, other.name).model_dump(mode="json", exclude={"name", "resolution", "distortion"})
-            warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given))
-            pair = pair._replace(sigma=widened(pair.depth, pair.sigma, capture.camera, contradiction, given))
-        if not believed and request.least_confidence is None:
-            pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))
-        found.append(pair)
-    solution = _joined(found, frames, capture, mask)
-    solution.facts |= facts
+    pairs = [_measured(capture, frames, index, request, device, timings) for index in range(len(capture.manifest.other_cameras))]
+    solution = _joined([pair.depth for pair in pairs], frames, capture, mask)
+    solution.facts |= {"frames": len(frames), "cameras": [pair.facts for pair in pairs]}
+    solution.warnings += [said for pair in pairs for said in pair.warnings]
     if request.least_confidence is None:
-        warnings += _chance(solution, mask)
-    solution.warnings += [*warnings, *_doubts(solution, mask)]
+        solution.warnings += _chance(solution, mask)
+    solution.warnings += _doubts(solution, mask)
     return solution
+
+
+def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthRequest, device: str, timings: Timings) -> Measured:
+    """Measure depths with one other camera, and judge its calibration by what matches."""
+    other = capture.manifest.other_cameras[index]
+    rectify(capture.camera, other, where=f"{capture.folder / FILE_NAME}: other_cameras[{index}]")  # checks it before anything is read
+    given = as_projector(other, np.array(other.camera_from_other))
+
+    def measure(view: Projector, before: Contradiction | None) -> tuple[Matched, Contradiction | None]:
+        matched = _matched(capture, frames, index, as_camera(view, other.name), request, device, timings)
+        return matched, contradicted(matched.disparity.offsets, matched.geometry, view, before)
+
+    view, (geometry, span, disparity), contradiction = settled(given, measure, refine=request.refine_projector)
+    offsets = disparity.offsets
+    facts: dict[str, Any] = {
+        "name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
+        "disparity_px": [_short(end + geometry.offset_px) for end in span],
+        "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
+    if len(offsets.offset) >= ENOUGH:
+        facts["row_offset_px"] = statistics(offsets.offset)
+    pair = _triangulated(disparity, geometry, capture, request)
+    warnings: list[str] = []
+    believed = contradiction is None or contradiction.plausible
+    if believed and by_chance(offsets):
+        believed = False
+        warnings.append(f"frames: the places that match in the images of {other.name} lie in neighbouring rows at random, as in images "
+                        "that have nothing to do with each other: no depth is trusted")
+    elif contradiction is not None:
+        facts["contradiction_px"] = _short(contradiction.size_px)
+        if view is not given:
+            facts["refined"] = view_facts(view, "camera_from_other", view.camera_from_projector)
+        warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given))
+        pair = pair._replace(sigma=widened(pair.depth, pair.sigma, capture.camera, contradiction, given))
+    if not believed and request.least_confidence is None:
+        pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))
+    return Measured(pair, facts, warnings)
 
 
 def _matched(capture: Capture, frames: list[Frame], index: int, other: OtherCamera, request: DepthRequest, device: str,

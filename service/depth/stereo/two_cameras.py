@@ -16,7 +16,7 @@ from kernels.packs import padded_count
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.triangulate import triangulate
-from service.depth.base.epipolar import Contradiction, contradiction, settled
+from service.depth.base.epipolar import Contradiction, contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective, check_projector
 from service.depth.patterns.agreement import conclude, doubt_pixels
@@ -115,7 +115,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         told["contradiction_px"] = float(f"{contradicted.size_px:.3g}")
         if view is not given:
             pose = _world(capture) @ np.array(view.camera_from_projector)
-            told["refined"] = {"focal_px": view.focal_px, "principal_px": view.principal_px, "world_from_camera": pose.tolist()}
+            told["refined"] = view_facts(view, "world_from_camera", pose.tolist())
         if not contradicted.plausible and request.least_confidence is None:
             solution.status[solution.solved] = Status.UNSURE
     conclude(solution, doubt_pixels(solution, residual, capture.camera, view, device), mask, request, warnings)

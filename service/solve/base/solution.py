@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kernels.device import to_numpy
 from kernels.images import ImagesOnDevice
@@ -24,6 +25,8 @@ from stage.stack.stack import Stack
 
 AMBIGUOUS_DEGREES = 5.0
 """Standard error of a normal above which it is ambiguous."""
+NEIGHBOURS = 8
+"""Samples from which the error of a pixel between them is taken."""
 PIXELS_AT_ONCE = 1 << 16
 """Number of pixels that are looked at in one piece: it bounds the memory."""
 SUSPECT_PIXELS = 512
@@ -173,6 +176,18 @@ def raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
     """Add an independent error, of all normals or [pixels] of each, to their standard error."""
     before = solution.standard_error()
     solution.sigma = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before).astype(np.float16)
+
+
+def at_all_pixels(mask: np.ndarray, sampled: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return errors that are known at samples at all pixels of a mask, each the root mean square of the nearest.
+    `mask`: [rows, cols] bool. `sampled`: [samples] numbers of pixels. `values`: [samples]. Returns [pixels] float32, 0 outside the mask."""
+    tree = cKDTree(np.stack(np.divmod(sampled, mask.shape[1]), axis=1))
+    found = np.zeros(mask.size, np.float32)
+    for first in range(0, mask.size, PIXELS_AT_ONCE):
+        inside = first + np.flatnonzero(mask.reshape(-1)[first : first + PIXELS_AT_ONCE])
+        _, nearest = tree.query(np.stack(np.divmod(inside, mask.shape[1]), axis=1), k=range(1, min(NEIGHBOURS, len(sampled)) + 1))
+        found[inside] = np.sqrt((values**2)[nearest].mean(axis=-1))
+    return found
 
 
 def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
@@ -22,7 +21,7 @@ from service.light_estimation.explanations import (
     grey_readings,
 )
 from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
-from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, raise_error, suspect_lights
+from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.height.distance import NOISE, SQUARES, SURE, Lamps, NearFit, fit_near
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.placement import find_placement
@@ -56,8 +55,6 @@ MOST_STRENGTHS = 4
 """The most lights whose strength is fitted: those of which the readings are farthest from what the other lights predict."""
 MOST_LEVERAGE = 0.9
 """A reading with more leverage is not predicted by the others."""
-NEIGHBOURS = 8
-"""Compared pixels from which the error of a pixel between them is taken."""
 
 
 class OtherLights(NamedTuple):
@@ -189,9 +186,7 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
     if gain < best.least_gain or less.sum() < SURE * np.sqrt((less**2).sum()):
         return None
     turned = np.degrees(np.arccos(np.clip((far.normal * best.fit.normal).sum(axis=0), -1, 1)))
-    degrees = np.zeros(given.mask.size, np.float32)
-    _, nearest = cKDTree(at).query(place, k=min(NEIGHBOURS, len(at)))
-    degrees[np.flatnonzero(given.mask)] = np.sqrt((turned**2)[nearest].mean(axis=-1))
+    degrees = at_all_pixels(given.mask, np.flatnonzero(given.mask)[chosen][told], turned)
     return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees)
 
 

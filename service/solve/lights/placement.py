@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.spatial import cKDTree
 
-from service.solve.base.solution import SolveInput
+from service.solve.base.solution import SolveInput, at_all_pixels
 from service.solve.height.distance import (
     LEAST_LIGHTS,
     LEAST_PIXELS,
@@ -43,8 +42,6 @@ QUIET = 0.01
 """Cost that is added to what gains are parts of: that of a residual of a five hundredth, which rounding and a coarse grid leave."""
 MOST_MOVED, MOST_FACTOR = 2.0, 5.0
 """Largest move in the distance between two lights, and largest factor or its inverse: farther ones make up for another fault."""
-NEIGHBOURS = 8
-"""Compared pixels from which the error of a pixel between them is taken."""
 
 
 class Placement(NamedTuple):
@@ -132,17 +129,9 @@ class _Search:
             tried.append((float(found.fun), Move(found.x, holds)))
         return min(tried, key=lambda one: one[0])[1]
 
-    def spread(self, of_samples: np.ndarray, given: SolveInput, capture: Capture) -> np.ndarray:
-        """Return what holds at the sampled pixels [pixels] at all pixels of the image: the root mean square of the nearest; 0 outside the
-        mask."""
-        width = capture.camera.width
-        sampled = self.sample.pixels(width)
-        inside = np.flatnonzero(given.mask)
-        _, nearest = cKDTree(np.stack(np.divmod(sampled, width), axis=1)).query(
-            np.stack(np.divmod(inside, width), axis=1), k=min(NEIGHBOURS, len(sampled)))
-        found = np.zeros(given.mask.size, np.float32)
-        found[inside] = np.sqrt((of_samples**2)[nearest].mean(axis=-1))
-        return found
+    def at_all_pixels(self, given: SolveInput, values: np.ndarray) -> np.ndarray:
+        """Return errors that are known at the sampled pixels [pixels] at all pixels of the image."""
+        return at_all_pixels(given.mask, self.sample.pixels(given.mask.shape[1]), values)
 
 
 def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) -> Placement | None:
@@ -167,7 +156,7 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
         f"frames[].light.position_m: the near lights look moved by ({words}) m and {factor:.3g} times as far from the origin; the readings "
         f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m and camera.pixel_size_m, or take "
         "them as found (--lights refined)",
-        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.spread(_turned(*fits), given, capture))
+        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.at_all_pixels(given, _turned(*fits)))
 
 
 def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> RefinedPlaces:
@@ -191,7 +180,7 @@ def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> 
              "factor": float(f"{np.exp(found.values[3]):.5g}"), "irradiance_holds": found.irradiance_holds,
              "left_degrees": round(float(np.median(left)), 3)}
     return RefinedPlaces(PlacedLights.about(lights.centre, lamps.place, lights.strength * ratio[:, None], lights.lobe),
-                         search.spread(left, given, capture), {"refined_lights": facts}, ())
+                         search.at_all_pixels(given, left), {"refined_lights": facts}, ())
 
 
 def _turned(one: NearFit, other: NearFit) -> np.ndarray:
