@@ -30,12 +30,14 @@ from stage.errors import CalibrationError
 
 STEP = 0.05
 """First step of the search, in the largest distance between two lights, and as a part of the factor."""
-PROBE, LEAST_SLOPE = 0.0125, 0.01
+PROBE, LEAST_SLOPE = 0.0125, 0.003
 """Steps to either side that are tried before a search, and the least part of the cost that one of them must take away."""
 MOST_FITS, LENGTH, COST = 200, 2e-3, 1e-4
 """Fits after which the search ends, and the lengths (in that distance) and costs that end it before."""
 LEAST_GAIN = 0.06
 """Least part of the cost of the readings that other places take away. Where the declared ones are right it is up to 0.02, on gloss too."""
+EXPLAINED = 2.0
+"""Largest cost of half of the pixels under other places: velvet, which no Lambertian fit explains, leaves 2.6, gloss 1.3."""
 DEVICE = "cpu"
 """A grid of 32 × 32 pixels is solved some hundred times: a GPU would wait for the launches."""
 QUIET = 0.01
@@ -148,14 +150,14 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
     before, after = (cost_of(fit) for fit in fits)
     gain = float((before - after).mean()) / (float(before.mean()) + QUIET)
     less = np.bincount(squares_of(search.sample.mask), weights=before - after)
-    if not found.plausible or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
+    if not found.plausible or np.median(after) > EXPLAINED or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
         return None
     way, factor = search.span * found.values[:3], float(np.exp(found.values[3]))
     words = ", ".join(f"{length:+.3f}" for length in way)
     return Placement(
         f"frames[].light.position_m: the near lights look moved by ({words}) m and {factor:.3g} times as far from the origin; the readings "
-        f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m and camera.pixel_size_m, or take "
-        "them as found (--lights refined)",
+        f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m, camera.pixel_size_m, and that no "
+        "light of the room is in the images; or take them as found (--lights refined)",
         (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.at_all_pixels(given, _turned(*fits)))
 
 
