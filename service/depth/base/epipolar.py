@@ -34,6 +34,13 @@ ENOUGH = 33
 """Number of points whose errors are their own, below which nothing is concluded."""
 LEAST_GAIN = 50.0
 """Least drop of the squared residuals over their variance that tells a contradiction."""
+LEAST_SQUARE = 150.0
+"""Least square of the parameters over their covariance with that of blocks, where not all of them are fitted: cameras that boards have
+calibrated leave 10 to 125, one that was turned by 0.05° since 200, and by 0.2° 2000 and more."""
+BLOCKS = 5
+"""Blocks along each side of the image, whose residuals are taken to share an error."""
+HELD = 1e12
+"""Weight of what holds a parameter that is not fitted."""
 ROUNDS = 24
 """Number of fits from which the factor of the errors is found, each with the weights of Cauchy and the factor that the one before gives."""
 LAST_ROUNDS = 6
@@ -137,7 +144,7 @@ def _turned(projector: Projector, part: np.ndarray) -> Projector:
 
 
 def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, deviations: np.ndarray, *, least_px: float,
-                  alike: float = 1.0, before: Contradiction | None = None) -> Contradiction | None:
+                  alike: float = 1.0, free: int = len(PRIOR), before: Contradiction | None = None) -> Contradiction | None:
     """Return how the places of points contradict the calibration of a view, None where noise explains them.
 
     Args:
@@ -147,6 +154,7 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
         deviations: [points, 2] their standard deviations.
         least_px: least systematic distance from the epipolar lines that is one.
         alike: number of neighbours whose errors are counted as one.
+        free: number of the first parameters that are fitted; the others are as they were given.
         before: the contradiction by which the view was found. How far the view is from the one that was given then counts, and what the
             fit leaves open, however well it explains the places.
     """
@@ -160,28 +168,45 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
     own = np.sqrt(((normal * deviations[chosen].T)**2).sum(axis=0) + 1e-6)
     part, factor = np.zeros(len(PRIOR)), 1.0
     so_far = np.zeros(len(PRIOR)) if before is None else before.whole
+    slopes[:, free:] = 0
+    held = np.arange(len(PRIOR)) >= free
 
     def fitted() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parameters, their covariance, and the weights of the points that the parameters before gave."""
         left = (off - slopes @ part) / own
         scale = max(1.0, float(np.median(np.abs(left))) / 0.6745)
         weight = 1 / (1 + (left / (3 * scale))**2) / (own * scale)**2 / alike
-        covariance = np.linalg.inv((slopes * weight[:, None]).T @ slopes + np.eye(len(PRIOR)) / factor**2)
+        covariance = np.linalg.inv((slopes * weight[:, None]).T @ slopes + np.diag(np.where(held, HELD, 1 / factor**2)))
         return covariance @ ((slopes * weight[:, None]).T @ off - so_far / factor**2), covariance, weight
 
     for _ in range(ROUNDS):
         part, covariance, _ = fitted()
-        factor = float(np.sqrt(((so_far + part) @ (so_far + part) + np.trace(covariance)) / len(PRIOR)))
+        factor = float(np.sqrt(((so_far + part)**2 + np.diag(covariance))[:free].mean()))
     factor *= UNSEEN
     for _ in range(LAST_ROUNDS):
         part, covariance, weight = fitted()
     left = off - slopes @ part
     size = float(np.sqrt(np.mean((slopes @ part)**2)))
     gain = float((weight * (off**2 - left**2)).sum())
-    if before is None and (size < least_px or gain < LEAST_GAIN):
+    sure = True
+    if held.any():  # others may be wrong too, as far as whole blocks of the image say
+        covariance = covariance + _between_blocks(points[chosen], slopes * (weight * left)[:, None], covariance)
+        sure = float(part[:free] @ np.linalg.solve(covariance[:free, :free], part[:free])) > LEAST_SQUARE
+    if before is None and (size < least_px or gain < LEAST_GAIN or not sure):
         return None
     return Contradiction(size, float(np.median(np.abs(left))), projector, _turned(projector, part * PRIOR), part, covariance,
                          so_far + part)
+
+
+def _between_blocks(points: np.ndarray, scores: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance of the parameters for what whole blocks of the image leave alike, as distortions do that were measured badly.
+    `points`: [points, 3] in the camera frame. `scores`: [points, 8] residuals times their weights and slopes. Source: Liang and Zeger,
+    "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986, for residuals that clusters share."""
+    across, down = (np.searchsorted(np.quantile(values, np.arange(1, BLOCKS) / BLOCKS), values) for values in
+                    (points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]))
+    sums = np.zeros((BLOCKS**2, scores.shape[1]))
+    np.add.at(sums, across * BLOCKS + down, scores)
+    return np.asarray(covariance @ (sums.T @ sums) @ covariance)
 
 
 def settled(view: Projector, measure: Callable[[Projector, Contradiction | None], tuple[Found, Contradiction | None]], *,

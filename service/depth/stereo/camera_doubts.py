@@ -10,6 +10,9 @@ from stage.capture.projector import Projector
 
 LEAST_PX = 0.012
 """Least systematic distance from the epipolar lines that is one: interpolation and noise leave a fifth of it."""
+TURNED = 4
+"""Number of parameters that are fitted, turns and focal length: those of a camera that was hit or focused after it was calibrated. What
+boards leave open of the others compensates in places and depths, so that no line tells it."""
 CHANCE_PX = 0.25
 """Median difference of the row offsets of neighbouring places from which these match by chance. A camera that is rolled by a degree leaves
 a tenth, chance four tenths."""
@@ -30,9 +33,10 @@ def as_camera(view: Projector, name: str) -> OtherCamera:
                        distortion=view.distortion, camera_from_other=view.camera_from_projector)
 
 
-def contradicted(offsets: RowOffsets, geometry: Rectification, other: Projector, before: Contradiction | None) -> Contradiction | None:
+def contradicted(offsets: RowOffsets, geometry: Rectification, other: Projector, before: Contradiction | None = None, *,
+                 free: int = TURNED) -> Contradiction | None:
     """Return how the places that both cameras see contradict the calibration of the other; None where noise explains them.
-    `before`: the contradiction by which the other camera was found."""
+    `before`: the contradiction by which the other camera was found. `free`: number of parameters that are fitted."""
     focal, left, right = geometry.focal_px, geometry.left, geometry.right
     whole = offsets.disparity + geometry.offset_px
     ahead = whole > 0
@@ -41,7 +45,7 @@ def contradicted(offsets: RowOffsets, geometry: Rectification, other: Projector,
     points = _towards(left.left + col, left.top + row, focal) * depth[:, None] @ geometry.rectified_from_reference
     seen = _towards(right.left + col - disparity, right.top + row + offset, focal) @ geometry.rectified_from_other
     places = np.stack(geometry.other.image_coordinates(seen / -seen[:, 2:]), axis=1)
-    return contradiction(other, points, places, np.stack([sigma, sigma], axis=1), least_px=LEAST_PX, before=before)
+    return contradiction(other, points, places, np.stack([sigma, sigma], axis=1), least_px=LEAST_PX, free=free, before=before)
 
 
 def by_chance(offsets: RowOffsets) -> bool:

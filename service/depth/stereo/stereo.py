@@ -10,7 +10,7 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.base.epipolar import Contradiction, settled, view_facts
+from service.depth.base.epipolar import PRIOR, Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.frame_light import full_scale
@@ -48,6 +48,9 @@ REFUSED_SHARE = 0.5
 CHANCE_SHARE = 0.03
 """Share of the pixels with texture that must have a depth for any to be believed. Images that have nothing to do with each other leave one
 in a hundred by chance."""
+FEW = 0.3
+"""Share of the places with texture that match below which anything is tried that a calibration could have wrong, mirrored images and poses
+the other way round among it: a camera that was turned by a degree leaves a seventh to a half, right ones two thirds and more."""
 DOUBTED = 0.1
 """Factor of the confidence of depths that are not believed."""
 ENOUGH_TEXTURED = 200
@@ -124,6 +127,10 @@ def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthR
         facts["row_offset_px"] = statistics(offsets.offset)
     pair = _triangulated(disparity, geometry, capture, request)
     warnings: list[str] = []
+    textured = ~np.isin(disparity.status, (Status.UNSOLVED, Status.LOW_MODULATION))
+    if (disparity.status == Status.OK).sum() < FEW * textured.sum():  # perhaps because of what no turn explains
+        anything = contradicted(offsets, geometry, view, free=len(PRIOR))
+        contradiction = anything if anything is not None and not anything.plausible else contradiction
     believed = contradiction is None or contradiction.plausible
     if believed and by_chance(offsets):
         believed = False

@@ -22,7 +22,7 @@ from service.depth.base.triangulation_check import check_perspective, check_proj
 from service.depth.patterns.agreement import conclude, doubt_pixels
 from service.depth.patterns.coordinates import DecodedSolution
 from service.depth.patterns.patterns import projector_model, solve_patterns
-from service.depth.stereo.camera_doubts import LEAST_PX, as_projector, sentence, widened
+from service.depth.stereo.camera_doubts import LEAST_PX, TURNED, as_projector, sentence, widened
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -101,7 +101,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         u, v, sigma_u, sigma_v = (plane[judged] for plane in planes)
         return (solution, residual), contradiction(
             view, capture.camera.points(-solution.depth)[judged], np.stack([u, v], axis=1), np.stack([sigma_u, sigma_v], axis=1),
-            least_px=LEAST_PX, alike=float(2 * REACH + 1) ** 2, before=before)
+            least_px=LEAST_PX, alike=float(2 * REACH + 1) ** 2, free=TURNED, before=before)
 
     view, (solution, residual), contradicted = settled(given, measure, refine=request.refine_projector)
     told = {"capture": str(beside), "matched": int(places.found.sum()), "residual_px": statistics(residual[solution.solved])}
