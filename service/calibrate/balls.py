@@ -75,7 +75,8 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
     Returns the balls, as far off as they lie from these outlines, and a sentence for each that lies aside."""
     names = [*(f"--ball {circle.u:g},{circle.v:g},{circle.radius_px:g}" for circle in request.circles),
              *(f"--ball-mask {path}" for path in request.masks)]
-    camera, pictures = captures.source.camera, _pictures(captures, FRAMES)
+    camera = captures.source.camera
+    pictures = _pictures(captures, Correction.of(captures.source), FRAMES)
     result, said = [], []
     for name, ball in zip(names, balls, strict=True):
         outline = outline_near(camera, pictures, ball)
@@ -192,8 +193,9 @@ def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float |
 def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
           z_m: float | None) -> _Found:
     camera, correction = captures.source.camera, Correction.of(captures.source)
-    mean, brightest = _pictures(captures, len(captures.lit))
-    outlines = find_outlines(camera, [mean, brightest])[:CANDIDATES]
+    pictures = _pictures(captures, correction, len(captures.lit))
+    brightest = pictures[1]
+    outlines = find_outlines(camera, pictures)[:CANDIDATES]
     placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
     views = [view_ball(ball, camera) for _, ball in placed]
     seen: list[list[_Seen]] = [[] for _ in placed]
@@ -211,9 +213,9 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
     return _Found(balls, len(outlines))
 
 
-def _pictures(captures: LightCaptures, most: int) -> list[np.ndarray]:
+def _pictures(captures: LightCaptures, correction: Correction, most: int) -> list[np.ndarray]:
     """Return the mean and the brightest of frames, [rows, cols] 0 to 1, as outlines are looked for. `most`: how many frames, at most."""
-    camera, correction = captures.source.camera, Correction.of(captures.source)
+    camera = captures.source.camera
     mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
     chosen = evenly(len(captures.lit), most)
     for number in chosen:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
@@ -24,7 +23,6 @@ from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest
 from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.errors import CalibrationError, ManifestError
-from stage.importers.opencv_file import camera_from_projector
 from stage.model import Resolution
 
 MOST_ERROR_PX = 0.5
@@ -46,7 +44,7 @@ class OtherCalibration(NamedTuple):
     rms_px: float
     certainty: Certainty
     views: list[tuple[str, float, float]]
-    """Of each frame in which the first camera sees the board too: its name, and the errors of both in pixels, root mean square."""
+    """For each frame in which the first camera sees the board too: the frame's name, and the root mean square errors of both in pixels."""
 
 
 def alike_order(first: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -86,14 +84,11 @@ def calibrate(frames: Sequence[BoardFrame], cameras: Sequence[tuple[str, Resolut
     lenses = [lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True)]
     errors = {(sight.device, sight.view): float(error) for sight, error in zip(found.sights, found.errors_px, strict=True)}
     others = []
-    for device, (name, _) in list(enumerate(cameras))[1:]:
+    for device, (name, _) in enumerate(cameras[1:], start=1):
         both = [sight.view for sight in sights[device] if sight.view in firsts]
         pairs = [(frames[view].name, errors[0, view], errors[device, view]) for view in both]
-        counts = [(len(own.board), error) for own, error in zip(found.sights, found.errors_px, strict=True)
-                  if own.device in (0, device) and own.view in both]
-        rms = float(np.sqrt(np.average([error**2 for _, error in counts], weights=[count for count, _ in counts])))
-        pose = camera_from_projector(cv2.Rodrigues(found.places[device, :3])[0], found.places[device, 3:])
-        others.append(OtherCalibration(lenses[device], pose, rms, found.certainty(device, name), pairs))
+        rms = found.rms_px([sight.device in (0, device) and sight.view in both for sight in found.sights])
+        others.append(OtherCalibration(lenses[device], found.pose(device), rms, found.certainty(device, name), pairs))
     return lenses[0], others
 
 

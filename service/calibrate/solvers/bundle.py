@@ -7,7 +7,7 @@ Source: Hartley and Zisserman, "Multiple View Geometry in Computer Vision", 2nd 
     chapter 18 for the adjustment of bundles; Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3, for
     the start, and for the parallel poses that leave a lens open.
 
-Convention: the axes of OpenCV, y down, z forward.
+Convention: the axes of OpenCV, y down, z forward, but for `Bundle.pose`.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stage.errors import CalibrationError
+from stage.importers.opencv_file import camera_from_projector
 
 LENS, POSE = 8, 6
 """Parameters of a lens (focal lengths, principal point, k1, k2, p1, p2), and of a pose (rotation vector and translation)."""
@@ -51,7 +52,7 @@ class Alone(NamedTuple):
 
     lens: Pinhole
     boards: dict[int, np.ndarray]
-    """Of each view that it sees, rotation vector and translation [6] from the board to the device."""
+    """By the number of each view that the device sees: rotation vector and translation [6] from the board to the device."""
     rms_px: float
 
 
@@ -59,11 +60,11 @@ class Certainty(NamedTuple):
     """Standard deviations of two devices, and of the depths that are triangulated with both."""
 
     focal: tuple[float, float]
-    """Of the focal length of each device, as a part of it."""
+    """The standard deviation of each device's focal length, as a part of that length."""
     principal_px: tuple[float, float]
-    """Of the principal point of each device."""
+    """The standard deviation of each device's principal point, in pixels."""
     depth: float
-    """Of depths where the board was, as a part of them: root mean square over its corners."""
+    """The standard deviation of depths where the board was, as a part of the depth: root mean square over its corners."""
 
     def facts(self) -> dict[str, Any]:
         """Return the standard deviations as the report has them."""
@@ -82,14 +83,18 @@ class Bundle(NamedTuple):
     lenses: list[Pinhole]
     places: np.ndarray  # [devices, 6] rotation vector and translation from the first device to each, zeros for the first
     boards: dict[int, np.ndarray]
-    """Of each view, rotation vector and translation [6] from the board to the first device."""
+    """By the number of each view: rotation vector and translation [6] from the board to the first device."""
     errors_px: np.ndarray  # [sights] root mean square
     covariance: np.ndarray  # of the parameters of all lenses and then of all places but the first
 
-    @property
-    def rms_px(self) -> float:
-        """Return the root mean square of all corners."""
-        return float(np.sqrt(np.average(self.errors_px**2, weights=[len(sight.board) for sight in self.sights])))
+    def rms_px(self, counted: Sequence[bool] | None = None) -> float:
+        """Return the root mean square error of the corners. `counted`: of each sight, whether its corners count; None: all do."""
+        weights = np.array([len(sight.board) for sight in self.sights])
+        return float(np.sqrt(np.average(self.errors_px**2, weights=weights if counted is None else weights * counted)))
+
+    def pose(self, device: int) -> np.ndarray:
+        """Return where a device stands in the frame of the first one, [4, 4] metres, both with the axes of a manifest's cameras."""
+        return camera_from_projector(cv2.Rodrigues(self.places[device, :3])[0], self.places[device, 3:])
 
     def certainty(self, device: int, name: str) -> Certainty:
         """Return how sure a device and the first one are. Raises CalibrationError: the poses of the board leave depths open."""

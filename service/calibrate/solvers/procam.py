@@ -20,7 +20,7 @@ import numpy as np
 from service.calibrate.solvers.bundle import Certainty, Pinhole, Sight, adjust, alone
 from stage.capture.camera import Distortion
 from stage.errors import CalibrationError
-from stage.importers.opencv_file import camera_from_projector, distortion_of
+from stage.importers.opencv_file import distortion_of
 
 LEAST_VIEWS = 3
 """The least count of poses that determine a camera; more and differently tilted poses make it more accurate."""
@@ -145,8 +145,7 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     found = adjust([*sights[0], *sights[1]], devices)
     camera, projector = (lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True))
     errors, lit = found.errors_px.reshape(2, len(views))
-    return ProCam(camera, projector, camera_from_projector(cv2.Rodrigues(found.places[1, :3])[0], found.places[1, 3:]), errors, lit,
-                  found.rms_px, found.certainty(1, "camera and projector"))
+    return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector"))
 
 
 def outliers(found: ProCam) -> np.ndarray:

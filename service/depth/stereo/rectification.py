@@ -101,14 +101,20 @@ class Rectification(NamedTuple):
         return towards[..., 0] / z * self.focal_px - self.left.left, towards[..., 1] / z * self.focal_px - self.left.top, towards[..., 2]
 
 
+def pose_of(other: OtherCamera, *, where: str) -> np.ndarray:
+    """Return where another camera stands in the frame of the camera, [4, 4] metres.
+    `where`: the file and the field of the other camera, for messages. Raises ManifestError: it is not calibrated."""
+    if other.camera_from_other is None:
+        raise ManifestError(f"{where}: {other.name} has no focal_px and no camera_from_other: depth needs its lens and pose; "
+                            "relit calibrate stereo measures them")
+    return np.array(other.camera_from_other, dtype=np.float64)
+
+
 def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectification:
     """Return how the images of two cameras are rectified.
     `where`: the file and the field of the other camera, for messages. Raises ManifestError: the other camera is not calibrated; the
     cameras stand at one place or implausibly far apart, one behind the other, or look in different directions."""
-    if other.camera_from_other is None:
-        raise ManifestError(f"{where}: {other.name} has no focal_px and no camera_from_other: depth needs its lens and pose; "
-                            "relit calibrate stereo measures them")
-    pose = np.array(other.camera_from_other, dtype=np.float64)
+    pose = pose_of(other, where=where)
     centre = OPENCV_FROM_CAMERA @ pose[:3, 3]
     baseline = float(np.linalg.norm(centre))
     if baseline < LEAST_BASELINE_M:

@@ -15,7 +15,7 @@ from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.frame_light import full_scale
 from service.depth.stereo.camera_doubts import ENOUGH, as_camera, as_projector, by_chance, contradicted, sentence, widened
-from service.depth.stereo.rectification import Rectification, RectifiedFrames, rectified_frames, rectify
+from service.depth.stereo.rectification import Rectification, RectifiedFrames, pose_of, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import (
     LEAST_PLACES,
     MOST_LABELS,
@@ -110,8 +110,7 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
 def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthRequest, device: str, timings: Timings) -> Measured:
     """Measure depths with one other camera, and judge its calibration by what matches."""
     other = capture.manifest.other_cameras[index]
-    rectify(capture.camera, other, where=f"{capture.folder / FILE_NAME}: other_cameras[{index}]")  # checks it before anything is read
-    given = as_projector(other, np.array(other.camera_from_other))
+    given = as_projector(other, pose_of(other, where=f"{capture.folder / FILE_NAME}: other_cameras[{index}]"))
 
     def measure(view: Projector, before: Contradiction | None) -> tuple[Matched, Contradiction | None]:
         matched = _matched(capture, frames, index, as_camera(view, other.name), request, device, timings)

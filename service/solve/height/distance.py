@@ -226,11 +226,12 @@ def _cost(sample: NearSample, depth: float, device: str) -> np.ndarray:
     return cost_of(surface_at(sample, depth, device))
 
 
-def cost_of(fit: NearFit) -> np.ndarray:
-    """Return the cost of each pixel, [pixels]: the mean over its lit readings of ln(1 + (residual / noise)²)."""
+def cost_of(fit: NearFit, *, least_lit: int = LEAST_LIT, unlit: float = float(np.log1p(1 / NOISE**2))) -> np.ndarray:
+    """Return the cost of each pixel, [pixels]: the mean over its lit readings of ln(1 + (residual / noise)²), or `unlit` where fewer than
+    `least_lit` are lit."""
     lit = fit.lit.sum(axis=0)
     cost = np.where(fit.lit, np.log1p((fit.residual / NOISE) ** 2), 0).sum(axis=0) / np.maximum(lit, 1)
-    return np.where(lit >= LEAST_LIT, cost, np.log1p(1 / NOISE**2))
+    return np.where(lit >= least_lit, cost, unlit)
 
 
 def surface_at(sample: NearSample, depth: float, device: str) -> NearFit:

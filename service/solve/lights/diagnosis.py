@@ -22,7 +22,7 @@ from service.light_estimation.explanations import (
 )
 from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
-from service.solve.height.distance import NOISE, SQUARES, SURE, Lamps, NearFit, fit_near
+from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.placement import find_placement
 from stage.capture.capture import Capture
@@ -262,7 +262,5 @@ def _fit(sample: _Sample, place: np.ndarray) -> NearFit:
 
 
 def _cost(fit: NearFit) -> np.ndarray:
-    """Return the cost of each pixel: mean over its lit readings of ln(1 + (residual / noise)²)."""
-    count = fit.lit.sum(axis=0)
-    total = np.where(fit.lit, np.log1p((fit.residual / NOISE) ** 2), 0).sum(axis=0)
-    return np.where(count >= LEAST_LIT, total / np.maximum(count, 1), 0.0)
+    """Return the cost of each pixel; one that too few lights light has none."""
+    return cost_of(fit, least_lit=LEAST_LIT, unlit=0.0)

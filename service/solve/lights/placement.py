@@ -141,13 +141,15 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
     search = _Search(given, capture, lights)
     if not search.possible:
         return None
-    here = float(cost_of(search.fit(STAY)).mean()) + QUIET
+    declared = search.fit(STAY)
+    before = cost_of(declared)
     steps = [Move(step, holds) for step in PROBE * np.vstack([np.eye(4), -np.eye(4)]) for holds in (False, True)]
-    if not any(here - QUIET - cost_of(search.fit(step)).mean() > LEAST_SLOPE * here for step in steps):
+    least = float(before.mean()) - LEAST_SLOPE * (float(before.mean()) + QUIET)
+    if not any(cost_of(search.fit(step)).mean() < least for step in steps):
         return None
     found = search.best()
-    fits = [search.fit(move) for move in (STAY, found)]
-    before, after = (cost_of(fit) for fit in fits)
+    moved = search.fit(found)
+    after = cost_of(moved)
     gain = float((before - after).mean()) / (float(before.mean()) + QUIET)
     less = np.bincount(squares_of(search.sample.mask), weights=before - after)
     if not found.plausible or np.median(after) > EXPLAINED or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
@@ -158,7 +160,7 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
         f"frames[].light.position_m: the near lights look moved by ({words}) m and {factor:.3g} times as far from the origin; the readings "
         f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m, camera.pixel_size_m, and that no "
         "light of the room is in the images; or take them as found (--lights refined)",
-        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.at_all_pixels(given, _turned(*fits)))
+        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.at_all_pixels(given, _turned(declared, moved)))
 
 
 def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> RefinedPlaces:
