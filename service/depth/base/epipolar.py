@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stage.capture.projector import Projector
+from stage.spread import between_blocks
 from stage.transforms import OPENCV_FROM_CAMERA
 
 PRIOR = np.array([0.02, 0.02, 0.02, 0.03, 0.02, 0.02, 0.015, 0.015])
@@ -37,8 +38,6 @@ LEAST_GAIN = 50.0
 LEAST_SQUARE = 150.0
 """Least square of the parameters over their covariance with that of blocks, where not all of them are fitted: cameras that boards have
 calibrated leave 10 to 125, one that was turned by 0.05° since 200, and by 0.2° 2000 and more."""
-BLOCKS = 5
-"""Blocks along each side of the image, whose residuals are taken to share an error."""
 HELD = 1e12
 """Weight of what holds a parameter that is not fitted."""
 ROUNDS = 24
@@ -190,23 +189,13 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
     gain = float((weight * (off**2 - left**2)).sum())
     sure = True
     if held.any():  # others may be wrong too, as far as whole blocks of the image say
-        covariance = covariance + _between_blocks(points[chosen], slopes * (weight * left)[:, None], covariance)
+        ahead = points[chosen, :2] / points[chosen, 2:]
+        covariance = covariance + between_blocks(covariance, slopes * (weight * left)[:, None], *ahead.T)
         sure = float(part[:free] @ np.linalg.solve(covariance[:free, :free], part[:free])) > LEAST_SQUARE
     if before is None and (size < least_px or gain < LEAST_GAIN or not sure):
         return None
     return Contradiction(size, float(np.median(np.abs(left))), projector, _turned(projector, part * PRIOR), part, covariance,
                          so_far + part)
-
-
-def _between_blocks(points: np.ndarray, scores: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance of the parameters for what whole blocks of the image leave alike, as distortions do that were measured badly.
-    `points`: [points, 3] in the camera frame. `scores`: [points, 8] residuals times their weights and slopes. Source: Liang and Zeger,
-    "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986, for residuals that clusters share."""
-    across, down = (np.searchsorted(np.quantile(values, np.arange(1, BLOCKS) / BLOCKS), values) for values in
-                    (points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]))
-    sums = np.zeros((BLOCKS**2, scores.shape[1]))
-    np.add.at(sums, across * BLOCKS + down, scores)
-    return np.asarray(covariance @ (sums.T @ sums) @ covariance)
 
 
 def settled(view: Projector, measure: Callable[[Projector, Contradiction | None], tuple[Found, Contradiction | None]], *,

@@ -11,6 +11,7 @@ import numpy as np
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
+from kernels.status import ESTIMATED
 from service.light_estimation.explanations import (
     PIXELS,
     Cause,
@@ -25,6 +26,7 @@ from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.placement import find_placement
+from service.solve.lights.turn import find_turn
 from stage.capture.capture import Capture
 from stage.capture.gradients import GradientFrames
 from stage.capture.lighting import ExtendedLights
@@ -91,7 +93,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     `lights`: the lights with which the normals were solved; readings are examined under distant ones. `declared`: the lights of the
     manifest, which may have other intensities."""
     field = FIELDS.get(type(lights), "the capture of the reference ball")
-    fit = None
+    fit = other = None
     if isinstance(lights, DistantLights):
         assert isinstance(declared, DistantLights)
         solution.suspects = suspect_lights(solution, given.stack, pad_lights(declared.direction, declared.irradiance, given.stack.scale))
@@ -127,6 +129,16 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
             raise_error(solution, axes.degrees)
         elif axes.matrices:
             raise_error(solution, _turned_by(solution.normal, axes))
+        return
+    if isinstance(lights, DistantLights) and other is None:
+        turn = find_turn(given, lights, solution.normal, np.isin(solution.status, ESTIMATED))
+        if turn is not None:
+            solution.warnings.append(
+                f"{field}: all lights look turned {turn.words()}: turned back, slopes or highlights fit what the images show; check that "
+                "the camera looks along the axis of the table, and that no light of the room is in the images, or take them as found "
+                "(--lights refined); sigma holds the error that this makes")
+            solution.facts["light_turn"] = turn.facts()
+            raise_error(solution, turn.error(solution.normal))
 
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:

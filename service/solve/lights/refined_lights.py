@@ -2,19 +2,26 @@
 
 The images of a Lambertian object have rank three, which gives the lights up to a 3×3 matrix that all share (`factorisation`). The matrix
 is that with which they lie closest to the given directions. So the errors that each light has of its own go, and what all have in common
-stays: n lights determine 2n numbers of which nine are taken from the table, and of independent errors √(9/2n) is left.
+stays: n lights determine 2n numbers of which nine are taken from the table, and of independent errors √(9/2n) is left. A turn that they
+have in common is told by the surface and its highlights (`turn`), before the others and after.
 
 Sources: Hayakawa, JOSA A 11(11), 1994, for the factorisation; Huber and Ronchetti, "Robust Statistics", 2009, for the re-weighting.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.photometric.lambertian.readings import pad_lights
+from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.model.samples import evenly
+from kernels.status import ESTIMATED
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.solution import SolveInput
 from service.solve.lights.factorisation import factorise
+from service.solve.lights.turn import Turn, find_turn
+from service.solve.methods.diffuse import solve_diffuse
 from stage.capture.point_lights import DistantLights
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
@@ -66,7 +73,33 @@ class RefinedLights(NamedTuple):
 
 
 def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
-    """Refine the lights of a capture; only their directions where a solve keeps the declared intensities."""
+    """Refine the lights of a capture: the turn that all have in common, what each has wrong of its own, and the turn that this had hidden;
+    only their directions where a solve keeps the declared intensities. Raises CalibrationError: there are too few lights, or they do not
+    explain the images."""
+    first = _turn_of(given, lights)
+    turned = lights if first is None else first.of(lights)
+    few = first is not None and len(lights.direction) < LEAST_LIGHTS
+    found = RefinedLights(turned, MODEL_DEGREES, {}, ()) if few else _one_by_one(given, turned)
+    second = None if few else _turn_of(given, found.lights)
+    turn = first if second is None else second.after(first)
+    if turn is None:
+        return found
+    lights = found.lights if second is None else second.of(found.lights)
+    left = float(np.hypot(found.left_degrees, turn.sigma_degrees))
+    told = found.facts.get("refined_lights", {}) | {"left_degrees": round(left, 3), "directions": lights.direction.round(5).tolist()}
+    return RefinedLights(lights, left, {"refined_lights": told, "light_turn": turn.facts()}, (
+        f"frames[].light.direction: all lights were turned {turn.words()}, as slopes or highlights say", *found.warnings))
+
+
+def _turn_of(given: SolveInput, lights: DistantLights) -> Turn | None:
+    """Return how lights are turned, as normals say that are solved with them."""
+    padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
+    solved = solve_diffuse(replace(given, sharing=None), padded, fit_normals=solve_robust)
+    return find_turn(given, lights, solved.normal, np.isin(solved.status, ESTIMATED))
+
+
+def _one_by_one(given: SolveInput, lights: DistantLights) -> RefinedLights:
+    """Refine what each light has wrong of its own."""
     inside = np.flatnonzero(given.mask)
     radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     try:
@@ -99,7 +132,8 @@ def refine_directions(readings: np.ndarray, usable: np.ndarray, directions: np.n
     """
     count = len(directions)
     if count < LEAST_LIGHTS:
-        raise CalibrationError(f"{count} distant lights: {LEAST_LIGHTS} or more are needed")
+        raise CalibrationError(f"{count} distant lights, which nothing says are all turned alike: to refine each, {LEAST_LIGHTS} or more "
+                               "are needed")
     found = factorise(readings, usable, directions)
     lights = _closest(found.lights, directions, with_strength=False)
     strength = np.log(np.linalg.norm(lights, axis=1))

@@ -1,0 +1,83 @@
+"""Whether all lights are declared turned alike, as where their table is in the frame of the rig and the camera looks along another axis.
+
+Turned lights explain the shading of the images as well as the right ones: normals are turned with them. Slopes tell such turns, because
+they are no longer those of a height, and highlights do, which turn otherwise.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.solve.base.solution import SolveInput
+from service.solve.lights.highlight_turn import LEAST_LIGHTS, Shown, turn_by_highlights
+from service.solve.lights.slope_turn import turn_by_slopes
+from stage.capture.point_lights import DistantLights
+
+LEAST_DEGREES, LARGEST_DEGREES = 1.5, 20.0
+"""Least turn that is remarked on, and the largest that is one: metal and velvet, which no Lambertian fit explains, make up larger ones."""
+APART = 3.0
+"""Standard deviations by which turns by slopes and by highlights may differ, where there are highlights; beyond them slopes are bent by
+what the model lacks."""
+MODEL = np.radians(0.5)
+"""Error of a turn that reflectances cause which the model does not have: lobes that are no GGX's make it 0.4 to 0.7°."""
+
+
+class Turn(NamedTuple):
+    """How all lights are turned, as the images say."""
+
+    right: Rotation
+    """The turn that brings declared directions, and normals that were solved with them, to the right ones."""
+    covariance: np.ndarray  # [3, 3] of its rotation vector, rad²
+
+    @property
+    def sigma_degrees(self) -> float:
+        """Return the standard deviation of a direction that is turned, degrees."""
+        return float(np.degrees(np.sqrt(2 / 3 * np.trace(self.covariance))))
+
+    def of(self, lights: DistantLights) -> DistantLights:
+        """Return lights, turned."""
+        return DistantLights(self.right.apply(lights.direction), lights.irradiance)
+
+    def after(self, other: "Turn | None") -> "Turn":
+        """Return this turn after another one that was made before it was found."""
+        return self if other is None else self._replace(right=self.right * other.right)
+
+    def words(self) -> str:
+        """Return by how much declared directions are off, for a sentence."""
+        axis = self.right.as_rotvec() / self.right.magnitude()
+        parts = ", ".join(f"{name} {part:+.2f}" for name, part in zip(("right", "up", "towards the camera"), axis, strict=True))
+        return f"by {np.degrees(self.right.magnitude()):.1f}° about the axis ({parts})"
+
+    def facts(self) -> dict[str, Any]:
+        """Return the turn as the report has it."""
+        return {"turn_degrees": [float(f"{angle:.4g}") for angle in np.degrees(self.right.as_rotvec())],
+                "sigma_degrees": float(f"{self.sigma_degrees:.3g}")}
+
+    def error(self, normal: np.ndarray) -> np.ndarray:
+        """Return by how much normals [3, pixels] differ from the right ones, [pixels] float32 degrees."""
+        moved = np.linalg.norm((self.right.as_matrix() - np.eye(3)).astype(np.float32) @ normal, axis=0)
+        return np.hypot(np.degrees(2 * np.arcsin(np.clip(moved / 2, 0, 1))), np.float32(self.sigma_degrees))
+
+
+def find_turn(given: SolveInput, lights: DistantLights, normal: np.ndarray, solved: np.ndarray) -> Turn | None:
+    """Return how distant lights are turned, by the surer of both ways; None where nothing says that they are.
+    `normal`: [3, pixels of the image] unit, as solved with these lights. `solved`: [pixels of the image] bool, where there is one."""
+    by_slopes = turn_by_slopes(normal, solved.reshape(given.mask.shape), given.camera, strict=len(lights.direction) < LEAST_LIGHTS)
+    shown = turn_by_highlights(given, lights, normal, solved)
+    found = []
+    if by_slopes is not None and (shown is None or _agree(by_slopes, shown)):
+        found.append(by_slopes)
+    if shown is not None and shown.sure:
+        found.append((shown.right, shown.covariance))
+    turns = [Turn(right, covariance + MODEL**2 * np.eye(3)) for right, covariance in found]
+    likely = [turn for turn in turns if LEAST_DEGREES <= np.degrees(turn.right.magnitude()) <= LARGEST_DEGREES]
+    return min(likely, key=lambda turn: turn.sigma_degrees, default=None)
+
+
+def _agree(by_slopes: tuple[Rotation, np.ndarray], shown: Shown) -> bool:
+    """Return whether slopes say the same as highlights, but for a turn about the viewing axis, of which highlights say nothing."""
+    right, covariance = by_slopes
+    apart = (right.as_rotvec() - shown.right.as_rotvec())[:2]
+    both = (covariance + shown.covariance)[:2, :2] + 2 * MODEL**2 * np.eye(2)
+    return bool(apart @ np.linalg.solve(both, apart) < APART**2)
