@@ -1,5 +1,5 @@
-"""Lights and materials other than declared: lamps near the object or elsewhere, one of five lights of twice the strength, and velvet; right
-ones beside.
+"""Lights and materials other than declared: lamps near the object or elsewhere, lights that are turned alike, one of five of twice the
+strength, and velvet; right ones beside.
 
 The scenes are an egg with waves on it and a field of random waves, in closed form, under lights on a spiral, with shot noise. Velvet is the
 inverted Gaussian of Ashikhmin, Premoze and Shirley, "A microfacet-based BRDF generator", SIGGRAPH 2000.
@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.trials.lights import trial, write_grey
 from benchmarks.trials.trial import Trial
-from service.requests.solve import Method
+from service.requests.solve import LightsKnown, Method
 
 SIZE = 96
 NOISE = 0.003
@@ -49,6 +50,9 @@ class Case:
     """By how much near lamps are declared aside of where they stand."""
     factor: float = 1.0
     """How many times as far from the origin near lamps are declared."""
+    turned: float = 0.0
+    """Angle in degrees by which all far lamps are declared turned about the axis to the right."""
+    refined: bool = False
 
 
 HALF_M = 0.1
@@ -65,6 +69,10 @@ CASES = [
     Case("egg, 8 near lights, declared 3 cm aside", "egg", "matt", 8, away=2.5, near=True, aside_m=(0.03, 0.0, 0.0)),
     Case("field, 12 near lights, declared 1.3 times as far", "field", "matt", 12, away=4.0, near=True, factor=1.3),
     Case("egg, gloss, 20 near lights, declared 4 cm too near", "egg", "gloss", 20, away=3.0, near=True, aside_m=(0.0, 0.0, -0.04)),
+    Case("egg, 8 lights, declared turned by 5°", "egg", "matt", 8, turned=5.0),
+    Case("egg, 8 lights, declared turned by 5°, refined", "egg", "matt", 8, turned=5.0, refined=True),
+    Case("field, gloss, 24 lights, declared turned by 10°", "field", "gloss", 24, turned=10.0),
+    Case("egg, gloss, 40 lights, declared turned by 5°, refined", "egg", "gloss", 40, turned=5.0, refined=True),
 ]
 
 
@@ -120,7 +128,8 @@ def write(folder: Path, case: Case, number: int) -> Surface:
     frames = []
     for place, (image, direction) in enumerate(zip(np.clip(images, 0, 1) * found.mask, directions, strict=True)):
         write_grey(folder / f"{place:02d}.exr", image)
-        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [np.pi] * 3}
+        told = Rotation.from_rotvec([case.turned, 0, 0], degrees=True).apply(direction)
+        light = {"type": "distant", "direction": told.tolist(), "irradiance": [np.pi] * 3}
         if case.near:
             away_m = case.factor * HALF_M * (case.away or 0.0)
             light = {"type": "point", "position_m": (away_m * direction + case.aside_m).tolist(),
@@ -141,5 +150,6 @@ def trials(data: Path | None) -> Iterator[Trial]:
             truth = write(Path(folder), case, number)
             method = Method.SVBRDF if case.lights >= 12 else Method.ROBUST
             placed = case.away is None or (case.near and not any(case.aside_m) and case.factor == 1)
-            right = placed and not case.doubled and case.material != "velvet"
-            yield trial(case.name, Path(folder), truth.normal, truth.mask, in_model=right, method=method)[0]
+            right = placed and not case.doubled and not case.turned and case.material != "velvet"
+            yield trial(case.name, Path(folder), truth.normal, truth.mask, in_model=right, method=method,
+                        lights=LightsKnown.REFINED if case.refined else LightsKnown.DECLARED)[0]

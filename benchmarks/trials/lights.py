@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.accuracy import angles_deg
 from benchmarks.trials.trial import Trial
-from service.requests.solve import Method, SolveRequest
+from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.solve.solve import SolveResult, solve
 from stage.formats import exr
 from stage.importers import diligent
@@ -127,9 +127,9 @@ WRONG: dict[str, Change] = {
 
 
 def trial(name: str, folder: Path, truth: np.ndarray | None, mask: np.ndarray | None, *, in_model: bool,
-          method: Method = Method.ROBUST) -> tuple[Trial, SolveResult]:
+          method: Method = Method.ROBUST, lights: LightsKnown = LightsKnown.DECLARED) -> tuple[Trial, SolveResult]:
     """Solve a capture, and compare it with true normals (None: with nothing)."""
-    result = solve(SolveRequest(capture=folder, out=folder / "out", method=method, device="cpu"))
+    result = solve(SolveRequest(capture=folder, out=folder / "out", method=method, lights=lights, device="cpu"))
     maps = result.maps
     assert maps.normal is not None and maps.sigma is not None and maps.confidence is not None
     known = maps.mask if mask is None else mask

@@ -11,7 +11,6 @@ import numpy as np
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
-from kernels.status import ESTIMATED
 from service.light_estimation.explanations import (
     PIXELS,
     Cause,
@@ -130,8 +129,8 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
         elif axes.matrices:
             raise_error(solution, _turned_by(solution.normal, axes))
         return
-    if isinstance(lights, DistantLights) and other is None:
-        turn = find_turn(given, lights, solution.normal, np.isin(solution.status, ESTIMATED))
+    if isinstance(lights, DistantLights | PlacedLights) and other is None and moved is None:
+        turn = find_turn(given, lights, solution)
         if turn is not None:
             solution.warnings.append(
                 f"{field}: all lights look turned {turn.words()}: turned back, slopes or highlights fit what the images show; check that "

@@ -19,7 +19,7 @@ from kernels.photometric.model.samples import evenly
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.batches import view_directions
 from service.solve.base.solution import SolveInput
-from stage.capture.point_lights import DistantLights
+from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.spread import between_blocks
 
 PIXELS, LEAST_PIXELS, LEAST_LIGHTS = 600, 100, 8
@@ -49,7 +49,7 @@ class _Sample(NamedTuple):
     readings: np.ndarray  # [lights, pixels] radiance over irradiance
     usable: np.ndarray  # [lights, pixels] bool
     sigma: np.ndarray  # [lights, pixels]
-    direction: np.ndarray  # [lights, 3]
+    lamps: "_Lamps"
     view: np.ndarray  # [pixels, 3]
 
     def weights(self, left: np.ndarray) -> np.ndarray:
@@ -61,6 +61,24 @@ class _Sample(NamedTuple):
         return (self.usable * np.log1p((left / (OUTLIER * self.sigma))**2)).sum(axis=0)
 
 
+class _Lamps(NamedTuple):
+    """Lights around the centre of the object."""
+
+    way: np.ndarray  # [lights, 3] from the centre, metres; directions of distant lights
+    near: np.ndarray  # [lights, 1] 1.0 for near lights, else 0.0
+    lobe: np.ndarray  # [lights, 4] unit axis and exponent, as `PlacedLights` has it
+    points: np.ndarray  # [pixels, 3] from the centre, metres
+
+    def seen(self, turn: Rotation) -> tuple[np.ndarray, np.ndarray]:
+        """Return directions to the turned lights, [lights, pixels, 3], and their irradiance for strength 1, [lights, pixels]."""
+        points = np.stack([*self.points.T[:2], turn.apply(self.points)[:, 2]], axis=1)  # the surface was integrated from turned normals
+        way = turn.apply(self.way)[:, None] - self.near[..., None] * points
+        distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
+        direction = way / distance[..., None]
+        shining = np.maximum(-np.einsum("lpc,lc->lp", direction, turn.apply(self.lobe[:, :3])), 0) ** self.lobe[:, 3:]
+        return direction, shining * np.where(self.near == 1, 1 / distance**2, 1.0)
+
+
 class _Fit(NamedTuple):
     """Pixels and the turn that are fitted."""
 
@@ -70,12 +88,13 @@ class _Fit(NamedTuple):
 
     def left(self, sample: _Sample) -> np.ndarray:
         """Return readings less model, [lights, pixels]."""
-        return sample.readings - _reflect(self.normal, sample.view, self.turn.apply(sample.direction), np.exp(self.logs))
+        direction, shining = sample.lamps.seen(self.turn)
+        return sample.readings - _reflect(self.normal, sample.view, direction, np.exp(self.logs)) * shining
 
     def shown(self, sample: _Sample) -> float:
         """Return the part of the pixels that have a highlight."""
-        albedo = np.exp(self.logs[0])
-        matt = albedo / np.pi * np.maximum(self.turn.apply(sample.direction) @ self.normal.T, 0)
+        direction, shining = sample.lamps.seen(self.turn)
+        matt = np.exp(self.logs[0]) / np.pi * np.maximum((direction * self.normal).sum(axis=-1), 0) * shining
         whole = sample.readings - self.left(sample)
         return float(np.mean((whole - matt).max(axis=0) > SHOWN * whole.max(axis=0)))
 
@@ -97,24 +116,30 @@ class Shown(NamedTuple):
     """Whether the highlights say that the lights are turned."""
 
 
-def turn_by_highlights(given: SolveInput, lights: DistantLights, normal: np.ndarray, solved: np.ndarray) -> Shown | None:
+def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, normal: np.ndarray, solved: np.ndarray,
+                       height: np.ndarray | None) -> Shown | None:
     """Return what highlights show; None where there are none.
-    `normal`: [3, pixels of the image] unit, as solved with these lights. `solved`: [pixels of the image] bool, where there is one."""
+    `normal`: [3, pixels of the image] unit, as solved with these lights. `solved`: [pixels of the image] bool, where there is one.
+    `height`: [rows, cols] camera-frame z in metres, where lights are near."""
     pixels = np.flatnonzero(solved)
     pixels = pixels[evenly(len(pixels), PIXELS)]
     radiance, usable = given.stack.pick_radiance(pixels)
-    readings = grey_readings(radiance, lights.irradiance)
+    usable &= (usable.sum(axis=0) >= LEAST_LIGHTS)[None]
+    lamps, strength = _lamps(lights, None if height is None else given.camera.points(height).reshape(-1, 3)[pixels], len(pixels))
+    direction, shining = lamps.seen(Rotation.identity())
+    readings = grey_readings(radiance, strength)
     start = normal[:, pixels].T.astype(np.float64)
-    cosine = lights.direction @ start.T
-    lit = usable & (cosine > LIT)
-    chosen = (usable.sum(axis=0) >= LEAST_LIGHTS) & lit.any(axis=0)
+    cosine = (direction * start).sum(axis=-1) * shining
+    lit = usable & (cosine > LIT * shining) & (shining > 0)
+    chosen = lit.any(axis=0)
     if np.count_nonzero(chosen) < LEAST_PIXELS:
         return None
     pixels, readings, usable, start, cosine, lit = (
         pixels[chosen], readings[:, chosen], usable[:, chosen], start[chosen], cosine[:, chosen], lit[:, chosen])
+    lamps = lamps._replace(points=lamps.points[chosen])
     level = np.percentile(readings, 90, axis=0)
     level = np.maximum(level, np.median(level) / 2)
-    sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lights.direction,
+    sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lamps,
                      view_directions(given.camera)(pixels).astype(np.float64))
     albedo = np.pi * np.nanmedian(np.where(lit, readings / np.where(lit, cosine, 1), np.nan), axis=0)
     constant = np.log([[START_F0], [START_ROUGHNESS**2]])
@@ -132,6 +157,16 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights, normal: np.ndar
     else:
         sure = False
     return Shown(fit.turn, np.pad(covariance, (0, 1)), sure)
+
+
+def _lamps(lights: DistantLights | PlacedLights, points: np.ndarray | None, count: int) -> tuple[_Lamps, np.ndarray]:
+    """Return lights as some pixels see them, and their strength [lights, 3]. `points`: [pixels, 3] metres, where lights are near."""
+    if isinstance(lights, DistantLights):
+        none = np.zeros((len(lights.direction), 4))
+        return _Lamps(lights.direction, none[:, :1], none, np.zeros((count, 3))), lights.irradiance
+    assert points is not None
+    near = lights.place[:, 3:]
+    return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre), lights.strength
 
 
 def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarray, np.ndarray]) -> tuple[_Fit, np.ndarray]:
@@ -174,11 +209,11 @@ def _slopes(sample: _Sample, fit: _Fit, left: np.ndarray, sides: np.ndarray) -> 
 
 def _reflect(normal: np.ndarray, view: np.ndarray, light: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the radiance under lights of irradiance 1, [lights, pixels]: Lambert's law and the lobe of kernels.microfacet.
-    `normal`, `view`: [pixels, 3]. `light`: [lights, 3]. `values`: [3, pixels] albedo, F0 and α."""
+    `normal`, `view`: [pixels, 3]. `light`: [lights, pixels, 3]. `values`: [3, pixels] albedo, F0 and α."""
     albedo, f0, alpha = values
-    half = light[:, None] + view
+    half = light + view
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    toward_light, toward_viewer = np.maximum(light @ normal.T, 0), np.maximum((normal * view).sum(axis=-1), 0.05)
+    toward_light, toward_viewer = np.maximum((light * normal).sum(axis=-1), 0), np.maximum((normal * view).sum(axis=-1), 0.05)
     toward_half, square = np.clip((half * normal).sum(axis=-1), 0, 1), alpha**2
     masking = toward_light * np.sqrt(toward_viewer**2 * (1 - square) + square)
     masking += toward_viewer * np.sqrt(toward_light**2 * (1 - square) + square)

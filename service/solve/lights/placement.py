@@ -24,6 +24,7 @@ from service.solve.height.distance import (
     surface_at,
 )
 from service.solve.height.height import mean_height
+from service.solve.lights.turn import turn_of
 from stage.capture.capture import Capture
 from stage.capture.point_lights import PlacedLights
 from stage.errors import CalibrationError
@@ -42,6 +43,8 @@ DEVICE = "cpu"
 """A grid of 32 × 32 pixels is solved some hundred times: a GPU would wait for the launches."""
 QUIET = 0.01
 """Cost that is added to what gains are parts of: that of a residual of a five hundredth, which rounding and a coarse grid leave."""
+MOST_TURNS = 3
+"""Largest number of turns, each found after the one before was undone: one about the viewing axis is found a third too large at first."""
 MOST_MOVED, MOST_FACTOR = 2.0, 5.0
 """Largest move in the distance between two lights, and largest factor or its inverse: farther ones make up for another fault."""
 
@@ -164,7 +167,8 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
 
 
 def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> RefinedPlaces:
-    """Move all near lights together until they explain the images. Raises CalibrationError: the images do not tell it."""
+    """Move all near lights together until they explain the images, and turn them where these say that they are turned.
+    Raises CalibrationError: the images do not tell where they stand."""
     search = _Search(given, capture, lights)
     if not search.possible:
         raise CalibrationError(f"--lights refined: {int(search.near.sum())} near lights do not tell where they stand: {LEAST_LIGHTS} or "
@@ -183,8 +187,18 @@ def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> 
     facts = {"moved_m": [float(f"{metres:.4g}") for metres in search.span * found.values[:3]],
              "factor": float(f"{np.exp(found.values[3]):.5g}"), "irradiance_holds": found.irradiance_holds,
              "left_degrees": round(float(np.median(left)), 3)}
-    return RefinedPlaces(PlacedLights.about(lights.centre, lamps.place, lights.strength * ratio[:, None], lights.lobe),
-                         search.at_all_pixels(given, left), {"refined_lights": facts}, ())
+    moved = PlacedLights.about(lights.centre, lamps.place, lights.strength * ratio[:, None], lights.lobe)
+    doubt = search.at_all_pixels(given, left)
+    turn = None
+    for _ in range(MOST_TURNS):
+        again = turn_of(given, moved)
+        if again is None:
+            break
+        moved, turn = again.of(moved), again.after(turn)
+    if turn is None:
+        return RefinedPlaces(moved, doubt, {"refined_lights": facts}, ())
+    return RefinedPlaces(moved, np.hypot(doubt, np.float32(turn.sigma_degrees)),
+                         {"refined_lights": facts, "light_turn": turn.facts()}, (f"frames[].light.position_m: {turn.undone()}",))
 
 
 def _turned(one: NearFit, other: NearFit) -> np.ndarray:

@@ -8,20 +8,15 @@ have in common is told by the surface and its highlights (`turn`), before the ot
 Sources: Hayakawa, JOSA A 11(11), 1994, for the factorisation; Huber and Ronchetti, "Robust Statistics", 2009, for the re-weighting.
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.photometric.lambertian.readings import pad_lights
-from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.model.samples import evenly
-from kernels.status import ESTIMATED
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.solution import SolveInput
 from service.solve.lights.factorisation import factorise
-from service.solve.lights.turn import Turn, find_turn
-from service.solve.methods.diffuse import solve_diffuse
+from service.solve.lights.turn import turn_of
 from stage.capture.point_lights import DistantLights
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
@@ -76,11 +71,11 @@ def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
     """Refine the lights of a capture: the turn that all have in common, what each has wrong of its own, and the turn that this had hidden;
     only their directions where a solve keeps the declared intensities. Raises CalibrationError: there are too few lights, or they do not
     explain the images."""
-    first = _turn_of(given, lights)
+    first = turn_of(given, lights)
     turned = lights if first is None else first.of(lights)
     few = first is not None and len(lights.direction) < LEAST_LIGHTS
     found = RefinedLights(turned, MODEL_DEGREES, {}, ()) if few else _one_by_one(given, turned)
-    second = None if few else _turn_of(given, found.lights)
+    second = None if few else turn_of(given, found.lights)
     turn = first if second is None else second.after(first)
     if turn is None:
         return found
@@ -88,14 +83,7 @@ def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
     left = float(np.hypot(found.left_degrees, turn.sigma_degrees))
     told = found.facts.get("refined_lights", {}) | {"left_degrees": round(left, 3), "directions": lights.direction.round(5).tolist()}
     return RefinedLights(lights, left, {"refined_lights": told, "light_turn": turn.facts()}, (
-        f"frames[].light.direction: all lights were turned {turn.words()}, as slopes or highlights say", *found.warnings))
-
-
-def _turn_of(given: SolveInput, lights: DistantLights) -> Turn | None:
-    """Return how lights are turned, as normals say that are solved with them."""
-    padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
-    solved = solve_diffuse(replace(given, sharing=None), padded, fit_normals=solve_robust)
-    return find_turn(given, lights, solved.normal, np.isin(solved.status, ESTIMATED))
+        f"frames[].light.direction: {turn.undone()}", *found.warnings))
 
 
 def _one_by_one(given: SolveInput, lights: DistantLights) -> RefinedLights:

@@ -31,10 +31,13 @@ SETTLED = np.radians(0.001)
 """Change of a turn after which no more is looked for."""
 PRIOR, SUREST = 0.3, 2e-3
 """Standard deviation of turns (rad) and shears, which matters where a surface leaves some of them open, and of the surest slopes."""
-LEAST_SQUARE, LEAST_SQUARE_STRICT = 150.0, 1000.0
-"""Least square of a turn over its covariance: a turn of 5° has 100 to 1000 on real objects, and thousands on matt ones. Right captures have
-up to 145, of broad highlights under lights from one side up to 500, and 240 under fewer than eight lights, where shadows and highlights,
-taken for shading, bend whole regions."""
+LEAST_SQUARE, LEAST_SQUARE_STRICT = 50.0, 1000.0
+"""Least square of a turn over its covariance: a turn of 5° has 60 to 1000 on real objects and noisy matt scenes, and thousands on
+other matt ones. Right captures have up to 60, of broad highlights under lights from one side up to 500, and 240 under fewer than eight
+lights, where shadows and highlights, taken for shading, bend whole regions."""
+LARGEST_SIGMA = np.radians(1.5)
+"""Largest standard deviation of a turn about an axis: slopes that tell turns less well are bent by what the model lacks, and say more than
+they know."""
 LEAST_LESS = 4.0
 """Least sum over the boxes by which the costs of what is left drop, in the root of the sum of the squares of these drops: a turn
 of 5° has 5 to 9 on real balls, one of 10° on matt scenes 11 or more."""
@@ -47,6 +50,7 @@ class _Plane(NamedTuple):
     """The pixels that are looked at."""
 
     normal: np.ndarray  # [3, rows, cols]
+    sway: np.ndarray  # [3, rows, cols] places from the centre of the object over the distance of the lights, 0 where these are far
     mask: np.ndarray  # [rows, cols] bool
     x: np.ndarray  # [rows, cols] coordinates on the plane at depth 1, or orthographic ones
     y: np.ndarray  # [rows, cols]
@@ -67,12 +71,14 @@ class _Fit(NamedTuple):
     """Standard deviation of what is left."""
 
 
-def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, *, strict: bool = False) -> tuple[Rotation, np.ndarray] | None:
+def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, sway: np.ndarray | None = None, *,
+                   strict: bool = False) -> tuple[Rotation, np.ndarray] | None:
     """Return the turn that brings the lights with which normals were solved to the right ones, and the covariance [3, 3] of its rotation
     vector; None where the surface does not say that they are turned.
-    `normal`: [3, rows · cols] unit. `mask`: [rows, cols] bool, pixels that have one. `strict`: ask for more, where few lights gave the
-    normals."""
-    plane = _looked_at(normal, mask, camera)
+    `normal`: [3, rows · cols] unit. `mask`: [rows, cols] bool, pixels that have one. `sway`: [3, rows · cols] places from the centre about
+    which near lights turn, over their distance: away from it they stand aside as well; None: they are far. `strict`: ask for more, where
+    few lights gave the normals."""
+    plane = _looked_at(normal, np.zeros_like(normal) if sway is None else sway, mask, camera)
     if plane is None:
         return None
     right = Rotation.identity()
@@ -87,12 +93,12 @@ def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, *, stri
     assert given is not None and fit is not None  # the former asks for less
     vector = right.as_rotvec()
     less = np.log1p((given.left / (OUTLIER * given.scale))**2) - np.log1p((fit.left / (OUTLIER * given.scale))**2)
-    sure = np.nansum(less) > LEAST_LESS * np.sqrt(np.nansum(less**2))
+    sure = np.diag(fit.covariance).max() < LARGEST_SIGMA**2 and np.nansum(less) > LEAST_LESS * np.sqrt(np.nansum(less**2))
     square = float(vector @ np.linalg.solve(fit.covariance, vector))
     return (right, fit.covariance) if sure and square > (LEAST_SQUARE_STRICT if strict else LEAST_SQUARE) else None
 
 
-def _looked_at(normal: np.ndarray, mask: np.ndarray, camera: Camera) -> _Plane | None:
+def _looked_at(normal: np.ndarray, sway: np.ndarray, mask: np.ndarray, camera: Camera) -> _Plane | None:
     """Return every n-th pixel in both directions; None where no box has room."""
     step = max(1, round(np.sqrt(np.count_nonzero(mask)) / MOST_ACROSS))
     row, col = np.arange(0, mask.shape[0], step), np.arange(0, mask.shape[1], step)
@@ -102,27 +108,28 @@ def _looked_at(normal: np.ndarray, mask: np.ndarray, camera: Camera) -> _Plane |
     if min(inside.shape) <= width:
         return None
     least = SUREST * float(np.hypot(x[0, 1] - x[0, 0], y[1, 0] - y[0, 0])) * np.sqrt(width)
-    return _Plane(normal.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64), inside, x, y,
-                  camera.projection == "perspective", width, least)
+    normal, sway = (each.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64) for each in (normal, sway))
+    return _Plane(normal, sway, inside, x, y, camera.projection == "perspective", width, least)
 
 
 def _fit(plane: _Plane, turn: Rotation, changes: np.ndarray) -> _Fit | None:
     """Fit changes [changes, 3, 3] of normals that were turned so far; None: too little is seen."""
-    normal = np.einsum("ij,jrc->irc", turn.as_matrix(), plane.normal)
+    whole = np.einsum("ij,jrc->irc", turn.as_matrix(), plane.normal + plane.sway)
+    normal = whole - plane.sway
     toward = _toward(plane, normal)
     good = plane.mask & (toward > LEAST_TOWARD)
     slopes = np.where(good, -normal[:2] / np.where(good, toward, 1), 0)
-    whole = _sums(~good, plane.width) == 0
-    if np.count_nonzero(whole) < LEAST_BOXES:
+    inside = _sums(~good, plane.width) == 0
+    if np.count_nonzero(inside) < LEAST_BOXES:
         return None
-    steep = _sums((slopes**2).sum(axis=0), plane.width)[whole] / (plane.width + 1)**2
+    steep = _sums((slopes**2).sum(axis=0), plane.width)[inside] / (plane.width + 1)**2
     weight = (1 + steep)**-1.5  # as noise of slopes grows
     runs = []
     for change in changes:
-        moved = np.einsum("ij,jrc->irc", change, normal)
-        runs.append(_around(plane, np.where(good, -(moved[:2] + slopes * _toward(plane, moved)) / np.where(good, toward, 1), 0))[whole])
+        moved = np.einsum("ij,jrc->irc", change, whole)
+        runs.append(_around(plane, np.where(good, -(moved[:2] + slopes * _toward(plane, moved)) / np.where(good, toward, 1), 0))[inside])
     by = np.stack(runs, axis=1) * weight[:, None]
-    off = -_around(plane, slopes)[whole] * weight
+    off = -_around(plane, slopes)[inside] * weight
     found = np.zeros(by.shape[1])
     for _ in range(WEIGHTINGS):
         left = off - by @ found
@@ -131,9 +138,9 @@ def _fit(plane: _Plane, turn: Rotation, changes: np.ndarray) -> _Fit | None:
         inverse = np.linalg.inv((by * trust[:, None]).T @ by + (scale / PRIOR)**2 * np.eye(len(found)))
         found = inverse @ ((by * trust[:, None]).T @ off)
     left = off - by @ found
-    covariance = between_blocks(inverse, by * (trust * left)[:, None], *np.nonzero(whole))
-    everywhere = np.full(whole.shape, np.nan)
-    everywhere[whole] = left
+    covariance = between_blocks(inverse, by * (trust * left)[:, None], *np.nonzero(inside))
+    everywhere = np.full(inside.shape, np.nan)
+    everywhere[inside] = left
     return _Fit(found, covariance[:3, :3], everywhere, scale)
 
 

@@ -4,15 +4,22 @@ Turned lights explain the shading of the images as well as the right ones: norma
 they are no longer those of a height, and highlights do, which turn otherwise.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.solve.base.solution import SolveInput
+from kernels.status import ESTIMATED
+from service.requests.solve import Method
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.lights.highlight_turn import LEAST_LIGHTS, Shown, turn_by_highlights
 from service.solve.lights.slope_turn import turn_by_slopes
-from stage.capture.point_lights import DistantLights
+from service.solve.methods.methods import METHODS
+from stage.capture.camera import Camera
+from stage.capture.point_lights import DistantLights, PlacedLights
+
+Lights = TypeVar("Lights", DistantLights, PlacedLights)
 
 LEAST_DEGREES, LARGEST_DEGREES = 1.5, 20.0
 """Least turn that is remarked on, and the largest that is one: metal and velvet, which no Lambertian fit explains, make up larger ones."""
@@ -35,9 +42,14 @@ class Turn(NamedTuple):
         """Return the standard deviation of a direction that is turned, degrees."""
         return float(np.degrees(np.sqrt(2 / 3 * np.trace(self.covariance))))
 
-    def of(self, lights: DistantLights) -> DistantLights:
-        """Return lights, turned."""
-        return DistantLights(self.right.apply(lights.direction), lights.irradiance)
+    def of(self, lights: Lights) -> Lights:
+        """Return lights that are turned, near ones about the centre of the object."""
+        if isinstance(lights, DistantLights):
+            return DistantLights(self.right.apply(lights.direction), lights.irradiance)
+        near = lights.place[:, 3:]
+        place = self.right.apply(lights.place[:, :3] - near * lights.centre) + near * lights.centre
+        lobe = np.concatenate([self.right.apply(lights.lobe[:, :3]), lights.lobe[:, 3:]], axis=1)
+        return PlacedLights.about(lights.centre, np.concatenate([place, near], axis=1), lights.strength, lobe)
 
     def after(self, other: "Turn | None") -> "Turn":
         """Return this turn after another one that was made before it was found."""
@@ -48,6 +60,10 @@ class Turn(NamedTuple):
         axis = self.right.as_rotvec() / self.right.magnitude()
         parts = ", ".join(f"{name} {part:+.2f}" for name, part in zip(("right", "up", "towards the camera"), axis, strict=True))
         return f"by {np.degrees(self.right.magnitude()):.1f}° about the axis ({parts})"
+
+    def undone(self) -> str:
+        """Return that the turn was undone, for a sentence."""
+        return f"all lights were turned {self.words()}, as slopes or highlights say"
 
     def facts(self) -> dict[str, Any]:
         """Return the turn as the report has it."""
@@ -60,11 +76,13 @@ class Turn(NamedTuple):
         return np.hypot(np.degrees(2 * np.arcsin(np.clip(moved / 2, 0, 1))), np.float32(self.sigma_degrees))
 
 
-def find_turn(given: SolveInput, lights: DistantLights, normal: np.ndarray, solved: np.ndarray) -> Turn | None:
-    """Return how distant lights are turned, by the surer of both ways; None where nothing says that they are.
-    `normal`: [3, pixels of the image] unit, as solved with these lights. `solved`: [pixels of the image] bool, where there is one."""
-    by_slopes = turn_by_slopes(normal, solved.reshape(given.mask.shape), given.camera, strict=len(lights.direction) < LEAST_LIGHTS)
-    shown = turn_by_highlights(given, lights, normal, solved)
+def find_turn(given: SolveInput, lights: DistantLights | PlacedLights, solution: Solution) -> Turn | None:
+    """Return how lights are turned, by the surer of both ways; None where nothing says that they are.
+    `solution`: that under these lights."""
+    solved = np.isin(solution.status, ESTIMATED)
+    by_slopes = turn_by_slopes(solution.normal, solved.reshape(given.mask.shape), given.camera,
+                               _sway(given.camera, lights, solution.height), strict=len(lights.direction) < LEAST_LIGHTS)
+    shown = turn_by_highlights(given, lights, solution.normal, solved, solution.height)
     found = []
     if by_slopes is not None and (shown is None or _agree(by_slopes, shown)):
         found.append(by_slopes)
@@ -73,6 +91,20 @@ def find_turn(given: SolveInput, lights: DistantLights, normal: np.ndarray, solv
     turns = [Turn(right, covariance + MODEL**2 * np.eye(3)) for right, covariance in found]
     likely = [turn for turn in turns if LEAST_DEGREES <= np.degrees(turn.right.magnitude()) <= LARGEST_DEGREES]
     return min(likely, key=lambda turn: turn.sigma_degrees, default=None)
+
+
+def _sway(camera: Camera, lights: DistantLights | PlacedLights, height: np.ndarray | None) -> np.ndarray | None:
+    """Return places from the centre of the object over the mean distance of its lights, [3, pixels]; None: the lights are far."""
+    if isinstance(lights, DistantLights) or height is None:
+        return None
+    near = lights.place[:, 3]
+    closeness = (near / np.linalg.norm(lights.place[:, :3] - near[:, None] * lights.centre, axis=1)).mean()
+    return np.asarray((camera.points(height).reshape(-1, 3) - lights.centre).T * closeness)
+
+
+def turn_of(given: SolveInput, lights: Lights) -> Turn | None:
+    """Return how lights are turned, as `robust` solves the capture under them."""
+    return find_turn(given, lights, METHODS[Method.ROBUST].solvers[type(lights)](replace(given, sharing=None), lights))
 
 
 def _agree(by_slopes: tuple[Rotation, np.ndarray], shown: Shown) -> bool:
