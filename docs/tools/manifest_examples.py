@@ -38,7 +38,7 @@ _RAY: Example = {"type": "ray", "origin_m": [0.15, 0.0, 0.0], "direction": [-0.2
 _STEREO: Example = {"images": ["right_0.png"]}
 _OTHER: Example = {
     "name": "right", "resolution": [1280, 1024], "focal_px": [1500.0, 1500.0], "principal_px": [641.2, 510.8], "distortion": _DISTORTION,
-    "camera_from_other": [[1, 0, 0, 0.12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    "camera_from_other": [[1, 0, 0, 0.12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "depth_sigma": 0.002}
 _CONTINUOUS: Example = {"type": "cw", "modulation_hz": 60_000_000, "reference_phase_rad": 1.570796, "source_m": [0.02, 0.0, 0.0]}
 
 EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
@@ -70,7 +70,7 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     Projector: ({
         "resolution": [1280, 800], "focal_px": [1750.0, 1750.0], "principal_px": [640.5, 790.0],
         "distortion": {"model": "brown_conrady", "k": [-0.05, 0.0, 0.0]},
-        "camera_from_projector": [[0.96, 0, -0.28, 0.2], [0, 1, 0, 0.01], [0.28, 0, 0.96, 0.05], [0, 0, 0, 1]],
+        "camera_from_projector": [[0.96, 0, -0.28, 0.2], [0, 1, 0, 0.01], [0.28, 0, 0.96, 0.05], [0, 0, 0, 1]], "depth_sigma": 0.002,
         "response": [0.0, 0.05, 0.22, 0.53, 1.0], "crosstalk": [[0.95, 0.04, 0.01], [0.06, 0.9, 0.04], [0.0, 0.05, 0.95]],
     },),
     UncalibratedProjector: ({"resolution": [1280, 800]}, {"resolution": [1280, 800], "response": [0.0, 0.05, 0.22, 0.53, 1.0],

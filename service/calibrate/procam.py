@@ -167,5 +167,6 @@ def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:
     projector = Projector.model_validate({
         "resolution": size, "focal_px": found.projector.focal, "principal_px": found.projector.principal,
         "distortion": found.projector.distortion, "camera_from_projector": found.camera_from_projector.tolist(),
+        "depth_sigma": float(f"{found.certainty.depth:.3g}"),
         **({} if before is None else {"response": before.response, "crosstalk": before.crosstalk})})
     return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, found.camera), "projector": projector})

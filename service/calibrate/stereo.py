@@ -182,6 +182,7 @@ def _updated(manifest: Manifest, lens: Lens, others: list[OtherCalibration]) -> 
     """Return the manifest with all cameras."""
     cameras = tuple(OtherCamera.model_validate({
         "name": camera.name, "resolution": camera.resolution, "focal_px": other.lens.focal, "principal_px": other.lens.principal,
-        "distortion": other.lens.distortion, "camera_from_other": other.camera_from_other.tolist()})
+        "distortion": other.lens.distortion, "camera_from_other": other.camera_from_other.tolist(),
+        "depth_sigma": float(f"{other.certainty.depth:.3g}")})
         for camera, other in zip(manifest.other_cameras, others, strict=True))
     return manifest.model_copy(update={"camera": calibrated_camera(manifest.camera, lens), "other_cameras": cameras})

@@ -27,6 +27,7 @@ from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import DepthRequest, Ranging
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Frame
+from stage.capture.projector import Projector
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ManifestError, storage
 from stage.files import write_text
@@ -125,6 +126,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     else:
         refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
         _check_plausible(solution, capture, using)
+        _tell_shared_error(solution, capture, using)
         timings.stage("points", 1)
         cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
         timings.stage("write", 1)
@@ -182,6 +184,24 @@ def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) 
     middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths
     if field is not None and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
         raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
+
+
+def _tell_shared_error(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
+    """Say how much the calibration leaves open of all depths together, which no standard deviation of a pixel holds."""
+    manifest, part = capture.manifest, 0.0
+    if using is Ranging.PATTERN and isinstance(manifest.projector, Projector):
+        part = manifest.projector.depth_sigma or 0.0
+    elif using is Ranging.STEREO:
+        part = max(other.depth_sigma or 0.0 for other in manifest.other_cameras)
+    solved = solution.solved
+    if not part or solution.sigma is None or not solved.any():
+        return
+    shared, own = part * float(np.median(solution.depth[solved])), float(np.median(solution.sigma[solved]))
+    solution.facts["calibration_sigma_m"] = float(f"{shared:.3g}")
+    if shared > own:
+        field = "projector" if using is Ranging.PATTERN else "other_cameras[]"
+        solution.warnings.append(f"{field}.depth_sigma: the calibration leaves {100 * part:.2g} % of depths open, {shared:.3g} m at the "
+                                 f"median: {shared / own:.2g} standard deviations of a pixel, which do not hold what all pixels share")
 
 
 def _reasons(solution: DepthSolution | DecodedSolution) -> str:

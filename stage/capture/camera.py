@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from stage.model import FirstFault, Positive, Resolution, Strict, Text
+from stage.model import FirstFault, Fraction, Positive, Resolution, Strict, Text
 from stage.pixels import Crop
 from stage.transforms import Transform, pixel_centres
 
@@ -189,6 +189,9 @@ class OtherCamera(Strict):
     """The lens distortion; None: none."""
     camera_from_other: Transform | None = None
     """The place of this camera in the camera frame, with the translation in metres; it looks along its own -z. None: not measured yet."""
+    depth_sigma: Fraction | None = None
+    """The standard deviation of depths that are triangulated with it, as a part of the depth, which the calibration leaves open and all
+    pixels share, as `relit calibrate stereo` writes it; None: not known."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from stage.capture.camera import Distortion
-from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict
+from stage.model import FirstFault, Fraction, NotNegative, Positive, Resolution, Rgb, Strict
 from stage.transforms import OPENCV_FROM_CAMERA, Transform
 
 
@@ -39,6 +39,9 @@ class Projector(UncalibratedProjector):
     """The lens distortion; None: none."""
     camera_from_projector: Transform
     """The place of the projector in the camera frame, with the translation in metres; the projector looks along its own -z."""
+    depth_sigma: Fraction | None = None
+    """The standard deviation of depths that are triangulated with it, as a part of the depth, which the calibration leaves open and all
+    pixels share, as `relit calibrate procam` writes it; None: not known."""
 
     def projector_from_camera(self) -> np.ndarray:
         """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.

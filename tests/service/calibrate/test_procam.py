@@ -78,6 +78,7 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     place = np.array(manifest.projector.camera_from_projector)[:3, 3]
     assert np.linalg.norm(place - boards.POSE[:3, 3]) < 0.005
     report = json.loads((folders[0] / "calibration.json").read_text())["procam"]
+    assert manifest.projector.depth_sigma == report["sigma"]["depth"] > 0
     assert len(report["views"]) == 5 and report["rms_px"] < 0.3 and report["left_out"] == []
     relit.done("depth", folders[0], "--out", tmp_path, "--read-noise", 0.0003)
     maps = DepthMaps.read(tmp_path / "depth.exr")

@@ -52,6 +52,19 @@ def test_gray_code_with_inverses(relit, tmp_path, suffix):
     assert files_in(tmp_path / "out") == {"depth.exr", "points.ply", "report.json"}
 
 
+def test_what_the_calibration_leaves_open_is_said(relit, tmp_path):
+    """No standard deviation of a pixel holds what all pixels share; it is said where it is more than that of the pixels."""
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
+    path = tmp_path / "capture.json"
+    manifest = json.loads(path.read_text())
+    for part, said in ((0.02, True), (1e-6, False)):
+        manifest["projector"]["depth_sigma"] = part
+        path.write_text(json.dumps(manifest))
+        maps, report = solve(relit, tmp_path)
+        assert report["found"]["calibration_sigma_m"] == pytest.approx(part * np.median(maps.depth[maps.mask]), rel=0.01)
+        assert any("projector.depth_sigma" in sentence for sentence in report["warnings"]) == said
+
+
 def test_edges_of_wide_stripes_are_refined(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column", stripe=8), *BLACK_WHITE])
     refined, _ = solve(relit, tmp_path)

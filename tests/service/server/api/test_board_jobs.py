@@ -135,6 +135,7 @@ def test_a_board_calibrates_cameras_as_the_command_does(server, client, tmp_path
     assert np.abs(np.array(ours["focal_px"]) / theirs["focal_px"] - 1).max() < 1e-5
     report = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["stereo"]
     assert report["capture"] == report["options"]["capture"] == identifier and str(server.data) not in json.dumps(report)
+    assert found["other_cameras"][0]["depth_sigma"] == report["other_cameras"][0]["sigma"]["depth"] > 0
     refused(client.post("/v1/jobs", json={"kind": "calibrate-stereo", "capture": identifier, "options": {"board": "9x6"}}), 422, "")
 
 
