@@ -85,7 +85,10 @@ def estimate_pulses(counts: np.ndarray, pulse: Pulse, device: str, shape_of: Cal
     if len(order) == 0:
         return None
     chosen = np.unique(np.concatenate([order[:HALF_PIXELS], order[:: max(len(order) // HALF_PIXELS, 1)]]))
-    return _among(_Counted(np.rint(counts[chosen]), device), top, pulse, shape_of, declared)
+    some = _Counted(np.rint(counts[chosen]), device)  # whose sums are others than those of what is rounded
+    if declared is not None and declared < some.top:
+        return None
+    return _among(some, int(some.top), pulse, shape_of, declared)
 
 
 def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCounts, np.ndarray], Pulse], declared: int | None
