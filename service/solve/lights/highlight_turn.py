@@ -19,6 +19,7 @@ from kernels.photometric.model.samples import evenly
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.batches import view_directions
 from service.solve.base.solution import SolveInput
+from stage.capture.camera import Camera
 from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.spread import between_blocks
 
@@ -30,6 +31,8 @@ START_F0, START_ROUGHNESS = 0.04, 0.4
 NOISE, DARK, OUTLIER = 0.01, 0.3, 3.0
 """Standard deviation of a reading in the bright ones of its pixel, the part of it that is left in the dark (as a square), and standard
 deviations from which a reading counts less."""
+LOWEST, HIGHEST = np.log([[1e-4], [1e-4], [1e-3]]), np.log([[1e3], [1.0], [1.0]])
+"""Bounds of the logarithms of albedo, F0 and α: in captures without a scale albedo may be any number."""
 HELD = np.array([0.0, 0.0, 1.0, 4.0, 4.0])
 """Weight of the parameters of a pixel as they are: readings that show no highlight leave its F0 and roughness open."""
 ROUNDS, ALONE, LARGEST_STEP = 20, 2, 0.3
@@ -102,7 +105,7 @@ class _Fit(NamedTuple):
         """Return another fit. `sides`: [2, pixels, 3] tangents of the normals. `steps`: [pixels, 5] along them and of the logarithms.
         `turn`: [2] about x and y."""
         normal = self.normal + (steps.T[:2, :, None] * sides).sum(axis=0)
-        return _Fit(normal / np.linalg.norm(normal, axis=1, keepdims=True), self.logs + steps.T[2:],
+        return _Fit(normal / np.linalg.norm(normal, axis=1, keepdims=True), np.clip(self.logs + steps.T[2:], LOWEST, HIGHEST),
                     Rotation.from_rotvec([*turn, 0]) * self.turn)
 
 
@@ -125,20 +128,20 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
     pixels = pixels[evenly(len(pixels), PIXELS)]
     radiance, usable = given.stack.pick_radiance(pixels)
     usable &= (usable.sum(axis=0) >= LEAST_LIGHTS)[None]
-    lamps, strength = _lamps(lights, None if height is None else given.camera.points(height).reshape(-1, 3)[pixels], len(pixels))
+    lamps, strength = _lamps(lights, given.camera, height, pixels)
     direction, shining = lamps.seen(Rotation.identity())
     readings = grey_readings(radiance, strength)
     start = normal[:, pixels].T.astype(np.float64)
     cosine = (direction * start).sum(axis=-1) * shining
     lit = usable & (cosine > LIT * shining) & (shining > 0)
-    chosen = lit.any(axis=0)
+    level = np.percentile(readings, 90, axis=0)
+    chosen = lit.any(axis=0) & (level > 0)
     if np.count_nonzero(chosen) < LEAST_PIXELS:
         return None
     pixels, readings, usable, start, cosine, lit = (
         pixels[chosen], readings[:, chosen], usable[:, chosen], start[chosen], cosine[:, chosen], lit[:, chosen])
     lamps = lamps._replace(points=lamps.points[chosen])
-    level = np.percentile(readings, 90, axis=0)
-    level = np.maximum(level, np.median(level) / 2)
+    level = np.maximum(level[chosen], np.median(level[chosen]) / 2)
     sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lamps,
                      view_directions(given.camera)(pixels).astype(np.float64))
     albedo = np.pi * np.nanmedian(np.where(lit, readings / np.where(lit, cosine, 1), np.nan), axis=0)
@@ -159,13 +162,14 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
     return Shown(fit.turn, np.pad(covariance, (0, 1)), sure)
 
 
-def _lamps(lights: DistantLights | PlacedLights, points: np.ndarray | None, count: int) -> tuple[_Lamps, np.ndarray]:
-    """Return lights as some pixels see them, and their strength [lights, 3]. `points`: [pixels, 3] metres, where lights are near."""
+def _lamps(lights: DistantLights | PlacedLights, camera: Camera, height: np.ndarray | None,
+           pixels: np.ndarray) -> tuple[_Lamps, np.ndarray]:
+    """Return lights as some pixels see them, and their strength [lights, 3]. `height`: [rows, cols] metres, where lights are near."""
     if isinstance(lights, DistantLights):
         none = np.zeros((len(lights.direction), 4))
-        return _Lamps(lights.direction, none[:, :1], none, np.zeros((count, 3))), lights.irradiance
-    assert points is not None
-    near = lights.place[:, 3:]
+        return _Lamps(lights.direction, none[:, :1], none, np.zeros((len(pixels), 3))), lights.irradiance
+    assert height is not None  # near lights have found it with the normals
+    near, points = lights.place[:, 3:], camera.points(height).reshape(-1, 3)[pixels]
     return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre), lights.strength
 
 

@@ -46,11 +46,20 @@ SHEARS = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 1, 0], [0, 0, 0], [0,
 """Changes of normals, [3, 3] each, that are fitted: turns about the axes, and what else integrability tells of a linear change."""
 
 
+class Nearness(NamedTuple):
+    """The surface under near lights, which stand aside of it as well where they turn about the centre of the object."""
+
+    height: np.ndarray  # [rows, cols] camera-frame z, metres
+    centre: np.ndarray  # [3] metres
+    closeness: float
+    """The mean inverse distance of the lights from the centre, per metre."""
+
+
 class _Plane(NamedTuple):
     """The pixels that are looked at."""
 
     normal: np.ndarray  # [3, rows, cols]
-    sway: np.ndarray  # [3, rows, cols] places from the centre of the object over the distance of the lights, 0 where these are far
+    sway: np.ndarray  # [3, rows, cols] places from the centre of the object over the distance of the lights; [3, 1, 1] 0: these are far
     mask: np.ndarray  # [rows, cols] bool
     x: np.ndarray  # [rows, cols] coordinates on the plane at depth 1, or orthographic ones
     y: np.ndarray  # [rows, cols]
@@ -71,14 +80,13 @@ class _Fit(NamedTuple):
     """Standard deviation of what is left."""
 
 
-def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, sway: np.ndarray | None = None, *,
+def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: Nearness | None = None, *,
                    strict: bool = False) -> tuple[Rotation, np.ndarray] | None:
     """Return the turn that brings the lights with which normals were solved to the right ones, and the covariance [3, 3] of its rotation
     vector; None where the surface does not say that they are turned.
-    `normal`: [3, rows · cols] unit. `mask`: [rows, cols] bool, pixels that have one. `sway`: [3, rows · cols] places from the centre about
-    which near lights turn, over their distance: away from it they stand aside as well; None: they are far. `strict`: ask for more, where
-    few lights gave the normals."""
-    plane = _looked_at(normal, np.zeros_like(normal) if sway is None else sway, mask, camera)
+    `normal`: [3, rows · cols] unit. `mask`: [rows, cols] bool, pixels that have one. `near`: None: the lights are far. `strict`: ask for
+    more, where few lights gave the normals."""
+    plane = _looked_at(normal, mask, camera, near)
     if plane is None:
         return None
     right = Rotation.identity()
@@ -98,7 +106,7 @@ def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, sway: n
     return (right, fit.covariance) if sure and square > (LEAST_SQUARE_STRICT if strict else LEAST_SQUARE) else None
 
 
-def _looked_at(normal: np.ndarray, sway: np.ndarray, mask: np.ndarray, camera: Camera) -> _Plane | None:
+def _looked_at(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: Nearness | None) -> _Plane | None:
     """Return every n-th pixel in both directions; None where no box has room."""
     step = max(1, round(np.sqrt(np.count_nonzero(mask)) / MOST_ACROSS))
     row, col = np.arange(0, mask.shape[0], step), np.arange(0, mask.shape[1], step)
@@ -108,8 +116,13 @@ def _looked_at(normal: np.ndarray, sway: np.ndarray, mask: np.ndarray, camera: C
     if min(inside.shape) <= width:
         return None
     least = SUREST * float(np.hypot(x[0, 1] - x[0, 0], y[1, 0] - y[0, 0])) * np.sqrt(width)
-    normal, sway = (each.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64) for each in (normal, sway))
-    return _Plane(normal, sway, inside, x, y, camera.projection == "perspective", width, least)
+    normal, perspective = normal.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64), camera.projection == "perspective"
+    sway = np.zeros((3, 1, 1))
+    if near is not None:
+        z = near.height[::step, ::step].astype(np.float64)
+        depth = -z if perspective else 1.0
+        sway = near.closeness * (np.stack([x * depth, y * depth, z]) - near.centre[:, None, None])
+    return _Plane(normal, sway, inside, x, y, perspective, width, least)
 
 
 def _fit(plane: _Plane, turn: Rotation, changes: np.ndarray) -> _Fit | None:

@@ -14,9 +14,8 @@ from kernels.status import ESTIMATED
 from service.requests.solve import Method
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.lights.highlight_turn import LEAST_LIGHTS, Shown, turn_by_highlights
-from service.solve.lights.slope_turn import turn_by_slopes
+from service.solve.lights.slope_turn import Nearness, turn_by_slopes
 from service.solve.methods.methods import METHODS
-from stage.capture.camera import Camera
 from stage.capture.point_lights import DistantLights, PlacedLights
 
 Lights = TypeVar("Lights", DistantLights, PlacedLights)
@@ -79,9 +78,11 @@ class Turn(NamedTuple):
 def find_turn(given: SolveInput, lights: DistantLights | PlacedLights, solution: Solution) -> Turn | None:
     """Return how lights are turned, by the surer of both ways; None where nothing says that they are.
     `solution`: that under these lights."""
+    if isinstance(lights, PlacedLights) and solution.height is None:
+        return None  # there is no surface
     solved = np.isin(solution.status, ESTIMATED)
     by_slopes = turn_by_slopes(solution.normal, solved.reshape(given.mask.shape), given.camera,
-                               _sway(given.camera, lights, solution.height), strict=len(lights.direction) < LEAST_LIGHTS)
+                               _nearness(lights, solution.height), strict=len(lights.direction) < LEAST_LIGHTS)
     shown = turn_by_highlights(given, lights, solution.normal, solved, solution.height)
     found = []
     if by_slopes is not None and (shown is None or _agree(by_slopes, shown)):
@@ -93,13 +94,13 @@ def find_turn(given: SolveInput, lights: DistantLights | PlacedLights, solution:
     return min(likely, key=lambda turn: turn.sigma_degrees, default=None)
 
 
-def _sway(camera: Camera, lights: DistantLights | PlacedLights, height: np.ndarray | None) -> np.ndarray | None:
-    """Return places from the centre of the object over the mean distance of its lights, [3, pixels]; None: the lights are far."""
+def _nearness(lights: DistantLights | PlacedLights, height: np.ndarray | None) -> Nearness | None:
+    """Return where near lights stand; None: they are far, or there is no surface."""
     if isinstance(lights, DistantLights) or height is None:
         return None
     near = lights.place[:, 3]
-    closeness = (near / np.linalg.norm(lights.place[:, :3] - near[:, None] * lights.centre, axis=1)).mean()
-    return np.asarray((camera.points(height).reshape(-1, 3) - lights.centre).T * closeness)
+    return Nearness(height, lights.centre,
+                    float((near / np.linalg.norm(lights.place[:, :3] - near[:, None] * lights.centre, axis=1)).mean()))
 
 
 def turn_of(given: SolveInput, lights: Lights) -> Turn | None:
