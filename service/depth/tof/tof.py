@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from kernels.device import to_numpy
-from kernels.status import ESTIMATED, Status, refuse_unsure
+from kernels.status import ESTIMATED, SOLVED, Status, refuse_unsure
 from kernels.tof.continuous.bilateral import smooth
 from kernels.tof.continuous.flying import mark_flying
 from kernels.tof.continuous.modulation import common_range_m, require_span
@@ -21,6 +21,7 @@ from kernels.tof.continuous.unwrap import END_SIGMAS
 from service.depth.base.solution import DepthSolution, RangeImage
 from service.depth.tof.continuous_wave import solve_correlations
 from service.depth.tof.histograms import solve_histograms
+from service.depth.tof.scatter import find_scatter
 from service.reporting.progress import Timings
 from service.requests.depth import TofFilter, TofOptions
 from stage.capture.camera import Camera
@@ -68,7 +69,7 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         timings.stage("phases", 1)
         found = solve_correlations(correlations, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit, usable=mask,
                                    device=device)
-    found = _corrected(found, options, calibration, path, near_m, far_m)
+    found = _scattered(_corrected(found, options, calibration, path, near_m, far_m), mask)
     return _depth_of(found, options, capture.camera, mask, device=device, timings=timings)
 
 
@@ -96,6 +97,19 @@ def _corrected(found: RangeImage, options: TofOptions, calibration: TofCalibrati
               & (range_m <= (math.inf if far_m is None else far_m) + END_SIGMAS * sigma))
     status = np.where(np.isin(found.status, ESTIMATED) & ~inside, int(Status.OUT_OF_RANGE), found.status)
     return replace(found, range_m=range_m.astype(np.float32), sigma_m=sigma.astype(np.float32), status=status)
+
+
+def _scattered(found: RangeImage, mask: np.ndarray) -> RangeImage:
+    """Return ranges whose standard deviations hold by how much they scatter from pixel to pixel."""
+    sure = np.isin(found.status, SOLVED) & (found.confidence >= found.least_confidence) & mask.reshape(-1)
+    scatter = find_scatter(*(values.reshape(mask.shape) for values in (found.range_m, found.sigma_m, sure)))
+    if scatter is None:
+        return found
+    sentence = (f"frames[].tof: ranges of neighbouring pixels differ by {scatter.times:.2g} times what their noise makes, "
+                f"{scatter.own_m:.2g} m that each pixel has of its own, as where their timers or phases have no common zero, or where the "
+                "surface is rough from pixel to pixel: the standard deviations hold that")
+    return replace(found, sigma_m=np.hypot(found.sigma_m, np.float32(scatter.own_m)), warnings=(*found.warnings, sentence),
+                   facts=found.facts | {"pixel_scatter_m": float(f"{scatter.own_m:.3g}")})
 
 
 def _depth_of(found: RangeImage, options: TofOptions, camera: Camera, mask: np.ndarray, *, device: str,
