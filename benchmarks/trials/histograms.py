@@ -54,6 +54,10 @@ class Case:
     """Scattering coefficient of fog, 1/m: single scattering from 0.2 m on, evenly in all directions."""
     ceiling: int | None = None
     """The largest number that the counter holds."""
+    hot: float = 0.0
+    """Counts that the timer adds to one bin of every pixel."""
+    own_bins: float = 0.0
+    """Standard deviation of the zeros of the pixels' timers, in bins."""
 
 
 CASES = (
@@ -76,6 +80,8 @@ CASES = (
     Case("pulsed, fog of 0.05 / m", in_model=False, photons=12000, fog=0.05),
     Case("pulsed, fog of 0.2 / m", in_model=False, photons=30000, fog=0.2),
     Case("pulsed, counters of 8 bits, full", in_model=False, photons=12000, ceiling=255),
+    Case("pulsed, one bin of every pixel hot", in_model=False, hot=60),
+    Case("pulsed, timers that each have a zero of their own", in_model=False, own_bins=1.5),
 )
 
 
@@ -128,6 +134,10 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[i
         missed = np.exp(-(np.cumsum(mean, axis=1) - mean) / case.pulses)
         first = missed * -np.expm1(-mean / case.pulses)
         counts = random.multinomial(case.pulses, np.concatenate([first, 1 - first.sum(axis=1, keepdims=True)], axis=1))[:, :-1]
+    counts[:, BINS // 2] += random.poisson(case.hot, len(counts))
+    if case.own_bins:
+        counts = np.stack([np.roll(one, by) for one, by in zip(counts, random.normal(0, case.own_bins, len(counts)).round().astype(int),
+                                                               strict=True)])
     if case.ceiling is not None:
         counts = np.minimum(counts, case.ceiling)
     if case.smoothed:

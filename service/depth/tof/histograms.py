@@ -47,25 +47,11 @@ def pattern_bins(counts: np.ndarray) -> np.ndarray:
     bright = counts[counts.sum(axis=1) > 0]
     if len(bright) == 0:
         return none
-    highest = bright.argmax(axis=1)
-    place = int(np.median(highest))
-    if (np.abs(highest - place) <= SAME_BIN).mean() < MOST_PIXELS:
-        return none
-    height = bright[:, max(place - SAME_BIN, 0) : place + SAME_BIN + 1].sum(axis=1)
-    low, middle, high = np.quantile(height, [0.16, 0.5, 0.84])
-    if 0.5 * (high - low) > EVEN * middle:
-        return none
     typical = np.median(bright, axis=0)
-    level = np.median(typical)
-    raised = typical > RAISED * level
-    inside = none.copy()
-    inside[max(place - SAME_BIN, 0) : place + SAME_BIN + 1] = True
-    for step in (-1, 1):
-        i = place + step * (SAME_BIN + 1)
-        while 0 <= i < bins and raised[i]:
-            inside[i] = True
-            i += step
-    if inside.sum() > bins // 2:
+    inside = _shared_pulse(bright, typical)
+    if not inside.any():
+        inside = _hot_bins(typical)
+    if not 0 < inside.sum() <= bins // 2:
         return none
     rest = np.where(inside, 0, bright)
     background = np.median(bright[:, ~inside], axis=1)
@@ -73,6 +59,36 @@ def pattern_bins(counts: np.ndarray) -> np.ndarray:
     if there.mean() < HIDDEN or rest[there].argmax(axis=1).std() < VARIED_BINS:
         return none
     return inside
+
+
+def _shared_pulse(bright: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """Return the bins of a pulse that is the highest of nearly all pixels, and even, [bin] bool.
+    `bright`: [pixel, bin] photons. `typical`: [bin] those of the median pixel."""
+    inside = np.zeros(len(typical), dtype=bool)
+    highest = bright.argmax(axis=1)
+    place = int(np.median(highest))
+    if (np.abs(highest - place) <= SAME_BIN).mean() < MOST_PIXELS:
+        return inside
+    height = bright[:, max(place - SAME_BIN, 0) : place + SAME_BIN + 1].sum(axis=1)
+    low, middle, high = np.quantile(height, [0.16, 0.5, 0.84])
+    if 0.5 * (high - low) > EVEN * middle:
+        return inside
+    raised = typical > RAISED * np.median(typical)
+    inside[max(place - SAME_BIN, 0) : place + SAME_BIN + 1] = True
+    for step in (-1, 1):
+        i = place + step * (SAME_BIN + 1)
+        while 0 <= i < len(inside) and raised[i]:
+            inside[i] = True
+            i += step
+    return inside
+
+
+def _hot_bins(typical: np.ndarray) -> np.ndarray:
+    """Return single bins that are far fuller than those beside them in most pixels, as those of a timer that counts its own clock, [bin]
+    bool; a pulse is wider. `typical`: [bin] photons of the median pixel."""
+    framed = np.pad(typical, 1, mode="reflect")
+    beside = np.maximum(framed[:-2], framed[2:])
+    return np.asarray((typical - beside > RETURN_SIGMAS * np.sqrt(np.maximum(beside, 1))) & (beside <= RAISED * np.median(typical) + 1))
 
 
 def without_bins(histograms: LiveCounts, bins: np.ndarray) -> LiveCounts:
@@ -178,7 +194,8 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     elif pattern[int(first_bin) :].any():
         warnings.append(f"frames[].tof: nearly all pixels show the same pulse at {start_m + bin_m * (np.argmax(pattern) + 0.5):.3g} to "
                         f"{start_m + bin_m * (len(pattern) - np.argmax(pattern[::-1]) - 0.5):.3g} m, which is taken for the camera's own "
-                        "light: returns are looked for outside of these bins; give --near-m beyond it, or before it to keep it")
+                        "light, or for bins that its timer fills: returns are looked for outside of them; give --near-m beyond it, or "
+                        "before it to keep it")
     histograms, shape, pile_up = _live(frames, photons_of, calibration, pattern, usable, device, warnings)
     pulse, source, zero_bins = _zero_of(shape, frames, calibration, warnings)
     found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=first_bin, last_bin=last_bin)

@@ -185,3 +185,13 @@ def test_photons_show_no_ceiling(counts):
 @pytest.mark.parametrize("ceiling", [255, 150])
 def test_a_ceiling_is_found(ceiling):
     assert full_count(np.minimum(COUNTS, ceiling)) == ceiling
+
+
+def test_a_bin_that_the_timer_fills_in_every_pixel_is_no_surface(tmp_path):
+    """It was the range of half of the pixels, sure of itself."""
+    counts = tof.histogram(VIEW, 3000, background=0.5, seed=5)
+    counts[..., 40] += np.random.default_rng(2).poisson(80, counts.shape[:2])
+    result = solve(tmp_path, counts)
+    assert any("same pulse" in sentence for sentence in result.warnings)
+    is_calibrated(ratios(result))
+    assert result.maps.mask.mean() > 0.9
