@@ -53,7 +53,6 @@ class _Sample(NamedTuple):
     usable: np.ndarray  # [lights, pixels] bool
     sigma: np.ndarray  # [lights, pixels]
     lamps: "_Lamps"
-    view: np.ndarray  # [pixels, 3]
 
     def weights(self, left: np.ndarray) -> np.ndarray:
         """Return the weights of readings that are off by `left`, [lights, pixels]."""
@@ -64,6 +63,15 @@ class _Sample(NamedTuple):
         return (self.usable * np.log1p((left / (OUTLIER * self.sigma))**2)).sum(axis=0)
 
 
+class _Seen(NamedTuple):
+    """Lights as pixels see them."""
+
+    direction: np.ndarray  # [lights, pixels, 3] unit
+    half: np.ndarray  # [lights, pixels, 3] unit, between light and viewer
+    rise: np.ndarray  # [lights, pixels] Schlick's rise of Fresnel's reflectance
+    shining: np.ndarray  # [lights, pixels] irradiance for strength 1
+
+
 class _Lamps(NamedTuple):
     """Lights around the centre of the object."""
 
@@ -71,15 +79,20 @@ class _Lamps(NamedTuple):
     near: np.ndarray  # [lights, 1] 1.0 for near lights, else 0.0
     lobe: np.ndarray  # [lights, 4] unit axis and exponent, as `PlacedLights` has it
     points: np.ndarray  # [pixels, 3] from the centre, metres
+    view: np.ndarray  # [pixels, 3] unit, to the viewer
 
-    def seen(self, turn: Rotation) -> tuple[np.ndarray, np.ndarray]:
-        """Return directions to the turned lights, [lights, pixels, 3], and their irradiance for strength 1, [lights, pixels]."""
+    def seen(self, turn: Rotation) -> _Seen:
+        """Return the turned lights."""
         points = np.stack([*self.points.T[:2], turn.apply(self.points)[:, 2]], axis=1)  # the surface was integrated from turned normals
         way = turn.apply(self.way)[:, None] - self.near[..., None] * points
         distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
         direction = way / distance[..., None]
-        shining = np.maximum(-np.einsum("lpc,lc->lp", direction, turn.apply(self.lobe[:, :3])), 0) ** self.lobe[:, 3:]
-        return direction, shining * np.where(self.near == 1, 1 / distance**2, 1.0)
+        shining = np.where(self.near == 1, 1 / distance**2, 1.0)
+        if self.lobe.any():
+            shining *= np.maximum(-np.einsum("lpc,lc->lp", direction, turn.apply(self.lobe[:, :3])), 0) ** self.lobe[:, 3:]
+        half = direction + self.view
+        half /= np.linalg.norm(half, axis=2, keepdims=True)
+        return _Seen(direction, half, (1 - np.einsum("lpc,pc->lp", half, self.view))**5, shining)
 
 
 class _Fit(NamedTuple):
@@ -89,15 +102,15 @@ class _Fit(NamedTuple):
     logs: np.ndarray  # [3, pixels] logarithms of albedo, F0 and α
     turn: Rotation
 
-    def left(self, sample: _Sample) -> np.ndarray:
-        """Return readings less model, [lights, pixels]."""
-        direction, shining = sample.lamps.seen(self.turn)
-        return sample.readings - _reflect(self.normal, sample.view, direction, np.exp(self.logs)) * shining
+    def left(self, sample: _Sample, seen: _Seen | None = None) -> np.ndarray:
+        """Return readings less model, [lights, pixels]. `seen`: the lights; None: they are turned anew."""
+        seen = sample.lamps.seen(self.turn) if seen is None else seen
+        return sample.readings - _reflect(self.normal, sample.lamps.view, seen, np.exp(self.logs)) * seen.shining
 
     def shown(self, sample: _Sample) -> float:
         """Return the part of the pixels that have a highlight."""
-        direction, shining = sample.lamps.seen(self.turn)
-        matt = np.exp(self.logs[0]) / np.pi * np.maximum((direction * self.normal).sum(axis=-1), 0) * shining
+        seen = sample.lamps.seen(self.turn)
+        matt = np.exp(self.logs[0]) / np.pi * np.maximum(np.einsum("lpc,pc->lp", seen.direction, self.normal), 0) * seen.shining
         whole = sample.readings - self.left(sample)
         return float(np.mean((whole - matt).max(axis=0) > SHOWN * whole.max(axis=0)))
 
@@ -129,21 +142,20 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
     radiance, usable = given.stack.pick_radiance(pixels)
     usable &= (usable.sum(axis=0) >= LEAST_LIGHTS)[None]
     lamps, strength = _lamps(lights, given.camera, height, pixels)
-    direction, shining = lamps.seen(Rotation.identity())
+    seen = lamps.seen(Rotation.identity())
     readings = grey_readings(radiance, strength)
     start = normal[:, pixels].T.astype(np.float64)
-    cosine = (direction * start).sum(axis=-1) * shining
-    lit = usable & (cosine > LIT * shining) & (shining > 0)
+    cosine = np.einsum("lpc,pc->lp", seen.direction, start) * seen.shining
+    lit = usable & (cosine > LIT * seen.shining) & (seen.shining > 0)
     level = np.percentile(readings, 90, axis=0)
     chosen = lit.any(axis=0) & (level > 0)
     if np.count_nonzero(chosen) < LEAST_PIXELS:
         return None
     pixels, readings, usable, start, cosine, lit = (
         pixels[chosen], readings[:, chosen], usable[:, chosen], start[chosen], cosine[:, chosen], lit[:, chosen])
-    lamps = lamps._replace(points=lamps.points[chosen])
+    lamps = lamps._replace(points=lamps.points[chosen], view=lamps.view[chosen])
     level = np.maximum(level[chosen], np.median(level[chosen]) / 2)
-    sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lamps,
-                     view_directions(given.camera)(pixels).astype(np.float64))
+    sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lamps)
     albedo = np.pi * np.nanmedian(np.where(lit, readings / np.where(lit, cosine, 1), np.nan), axis=0)
     constant = np.log([[START_F0], [START_ROUGHNESS**2]])
     first = _Fit(start, np.concatenate([np.log(np.maximum(albedo, 1e-3))[None], np.repeat(constant, len(pixels), axis=1)]),
@@ -165,12 +177,13 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
 def _lamps(lights: DistantLights | PlacedLights, camera: Camera, height: np.ndarray | None,
            pixels: np.ndarray) -> tuple[_Lamps, np.ndarray]:
     """Return lights as some pixels see them, and their strength [lights, 3]. `height`: [rows, cols] metres, where lights are near."""
+    view = view_directions(camera)(pixels).astype(np.float64)
     if isinstance(lights, DistantLights):
         none = np.zeros((len(lights.direction), 4))
-        return _Lamps(lights.direction, none[:, :1], none, np.zeros((len(pixels), 3))), lights.irradiance
+        return _Lamps(lights.direction, none[:, :1], none, np.zeros((len(pixels), 3)), view), lights.irradiance
     assert height is not None  # near lights have found it with the normals
     near, points = lights.place[:, 3:], camera.points(height).reshape(-1, 3)[pixels]
-    return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre), lights.strength
+    return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre, view), lights.strength
 
 
 def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarray, np.ndarray]) -> tuple[_Fit, np.ndarray]:
@@ -193,7 +206,8 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
         turn = inverse @ scores.sum(axis=(0, 1)) if turning and number >= ALONE else np.zeros(2)
         steps = np.clip(solved[..., 2] - solved[..., :2] @ turn, -LARGEST_STEP, LARGEST_STEP)
         still, moved = fit.moved(sides, np.zeros_like(steps), turn), fit.moved(sides, steps, turn)
-        left_still, left_moved = still.left(sample), moved.left(sample)
+        seen = sample.lamps.seen(still.turn)
+        left_still, left_moved = still.left(sample, seen), moved.left(sample, seen)
         better = sample.cost(left_moved) < sample.cost(left_still)
         damped = np.clip(np.where(better, damped / 3, damped * 5), 1e-6, 1e6)
         fit = _Fit(np.where(better[:, None], moved.normal, still.normal), np.where(better, moved.logs, still.logs), moved.turn)
@@ -205,24 +219,23 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
 def _slopes(sample: _Sample, fit: _Fit, left: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of the model by the parameters of each pixel, [lights, pixels, 5], and by the turn, [lights, pixels, 2]."""
     steps = [STEP * np.broadcast_to(unit, (len(fit.normal), 5)) for unit in np.eye(5)]
-    found = [fit.moved(sides, step, np.zeros(2)) for step in steps] + [
-        fit.moved(sides, np.zeros_like(steps[0]), STEP * unit) for unit in np.eye(2)]
-    slopes = np.stack([(left - other.left(sample)) / STEP for other in found], axis=-1)
-    return slopes[..., :5], slopes[..., 5:]
+    seen = sample.lamps.seen(fit.turn)
+    own = [fit.moved(sides, step, np.zeros(2)).left(sample, seen) for step in steps]
+    turned = [fit.moved(sides, np.zeros_like(steps[0]), STEP * unit).left(sample) for unit in np.eye(2)]
+    return np.stack([(left - other) / STEP for other in own], axis=-1), np.stack([(left - other) / STEP for other in turned], axis=-1)
 
 
-def _reflect(normal: np.ndarray, view: np.ndarray, light: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _reflect(normal: np.ndarray, view: np.ndarray, seen: _Seen, values: np.ndarray) -> np.ndarray:
     """Return the radiance under lights of irradiance 1, [lights, pixels]: Lambert's law and the lobe of kernels.microfacet.
-    `normal`, `view`: [pixels, 3]. `light`: [lights, pixels, 3]. `values`: [3, pixels] albedo, F0 and α."""
+    `normal`, `view`: [pixels, 3]. `values`: [3, pixels] albedo, F0 and α."""
     albedo, f0, alpha = values
-    half = light + view
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    toward_light, toward_viewer = np.maximum((light * normal).sum(axis=-1), 0), np.maximum((normal * view).sum(axis=-1), 0.05)
-    toward_half, square = np.clip((half * normal).sum(axis=-1), 0, 1), alpha**2
+    toward_light = np.maximum(np.einsum("lpc,pc->lp", seen.direction, normal), 0)
+    toward_viewer = np.maximum((normal * view).sum(axis=-1), 0.05)
+    toward_half, square = np.clip(np.einsum("lpc,pc->lp", seen.half, normal), 0, 1), alpha**2
     masking = toward_light * np.sqrt(toward_viewer**2 * (1 - square) + square)
     masking += toward_viewer * np.sqrt(toward_light**2 * (1 - square) + square)
     lobe = square * toward_light / (2 * np.pi * (1 - (1 - square) * toward_half**2)**2 * np.maximum(masking, 1e-6))
-    return np.asarray(albedo / np.pi * toward_light + (f0 + (1 - f0) * (1 - (half * view).sum(axis=-1))**5) * lobe)
+    return np.asarray(albedo / np.pi * toward_light + (f0 + (1 - f0) * seen.rise) * lobe)
 
 
 def _tangents(normal: np.ndarray) -> np.ndarray:
