@@ -77,7 +77,7 @@ def estimate_pulses(counts: np.ndarray, pulse: Pulse, device: str, shape_of: Cal
     total = counts.sum(axis=1)
     order = np.argsort(-total, kind="stable")
     order = order[total[order] > 0]
-    if len(order) == 0 or (declared is not None and declared < np.rint(total[order[0]])):
+    if len(order) == 0:
         return None
     top = int(np.rint(total[order[0]]))
     waiting = 1 - (np.cumsum(counts[order], axis=1) - counts[order]) / top  # part of the pulses left, if there are no more than `top`
@@ -85,10 +85,11 @@ def estimate_pulses(counts: np.ndarray, pulse: Pulse, device: str, shape_of: Cal
     if len(order) == 0:
         return None
     chosen = np.unique(np.concatenate([order[:HALF_PIXELS], order[:: max(len(order) // HALF_PIXELS, 1)]]))
-    some = _Counted(np.rint(counts[chosen]), device)  # whose sums are others than those of what is rounded
-    if declared is not None and declared < some.top:
+    some = _Counted(np.rint(counts[chosen]), device)
+    top = max(top, int(some.top))  # sums of rounded bins may be larger than rounded sums
+    if declared is not None and declared < top:
         return None
-    return _among(some, int(some.top), pulse, shape_of, declared)
+    return _among(some, top, pulse, shape_of, declared)
 
 
 def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCounts, np.ndarray], Pulse], declared: int | None

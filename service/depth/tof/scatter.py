@@ -30,24 +30,25 @@ class Scatter(NamedTuple):
 def find_scatter(range_m: np.ndarray, sigma_m: np.ndarray, sure: np.ndarray) -> Scatter | None:
     """Return by how much the ranges of pixels scatter, None where their standard deviations hold it, or the surface bends.
     `range_m`, `sigma_m`: [rows, cols] metres. `sure`: [rows, cols] bool, pixels whose ranges count."""
-    spreads, times = [], 0.0
-    for lag in (1, 2):
-        sides = [_beside(range_m, sigma_m, sure, lag, axis) for axis in (0, 1)]
-        off, told = (np.concatenate(values) for values in zip(*sides, strict=True))
-        if len(off) < ENOUGH:
-            return None
-        spreads.append(MAD_TO_SIGMA * float(np.median(np.abs(off))) / np.sqrt(6))
-        times = times or MAD_TO_SIGMA * float(np.median(np.abs(off) / np.maximum(told, 1e-12)))
-    if times < TIMES or spreads[1] > OF_PIXELS * spreads[0]:
+    (off, told), (farther, _) = (_beside(range_m, sigma_m, sure, lag) for lag in (1, 2))
+    if min(len(off), len(farther)) < ENOUGH:
         return None
-    return Scatter(spreads[0] * float(np.sqrt(1 - 1 / times**2)), times)
+    spread, second = (MAD_TO_SIGMA * float(np.median(np.abs(values))) / np.sqrt(6) for values in (off, farther))
+    times = MAD_TO_SIGMA * float(np.median(np.abs(off) / np.maximum(told, 1e-12)))
+    if times < TIMES or second > OF_PIXELS * spread:
+        return None
+    return Scatter(spread * float(np.sqrt(1 - 1 / times**2)), times)
 
 
-def _beside(range_m: np.ndarray, sigma_m: np.ndarray, sure: np.ndarray, lag: int, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much ranges are off from twice the mean of their neighbours `lag` pixels away, and the standard deviation of that."""
-    count = range_m.shape[axis]
-    parts = [slice(start, count - 2 * lag + start) for start in (0, lag, 2 * lag)]
-    (before, here, after), (first, middle, last), (one, two, three) = (
-        [np.take(values, range(*part.indices(count)), axis=axis) for part in parts] for values in (range_m, sigma_m, sure))
-    kept = one & two & three
-    return (before - 2 * here + after)[kept].astype(np.float64), np.sqrt(first**2 + 4 * middle**2 + last**2)[kept].astype(np.float64)
+def _beside(range_m: np.ndarray, sigma_m: np.ndarray, sure: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much ranges are off from twice the mean of their neighbours `lag` pixels away, along columns and rows, and the standard
+    deviations of that."""
+    off, told = [], []
+    for axis in (0, 1):
+        (before, here, after), (first, middle, last), kept = (
+            (lines[: -2 * lag], lines[lag:-lag], lines[2 * lag :])
+            for lines in (np.moveaxis(values, axis, 0) for values in (range_m, sigma_m, sure)))
+        known = np.logical_and.reduce(kept)
+        off.append((before - 2 * here + after)[known].astype(np.float64))
+        told.append(np.sqrt(first**2 + 4 * middle**2 + last**2)[known].astype(np.float64))
+    return np.concatenate(off), np.concatenate(told)

@@ -165,12 +165,11 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
     vector = fit.turn.as_rotvec()[:2]
     if fit.shown(sample) < LEAST_SHOWN:
         return None
-    if float(vector @ np.linalg.solve(covariance, vector)) > LEAST_SQUARE:
+    sure = float(vector @ np.linalg.solve(covariance, vector)) > LEAST_SQUARE
+    if sure:
         still, _ = _fitted(sample, first, turning=False, place=place)
         less = sample.cost(still.left(sample)) - sample.cost(fit.left(sample))
         sure = bool(less.sum() > LEAST_LESS * np.sqrt((less**2).sum()))
-    else:
-        sure = False
     return Shown(fit.turn, np.pad(covariance, (0, 1)), sure)
 
 
@@ -182,7 +181,7 @@ def _lamps(lights: DistantLights | PlacedLights, camera: Camera, height: np.ndar
         none = np.zeros((len(lights.direction), 4))
         return _Lamps(lights.direction, none[:, :1], none, np.zeros((len(pixels), 3)), view), lights.irradiance
     assert height is not None  # near lights have found it with the normals
-    near, points = lights.place[:, 3:], camera.points(height).reshape(-1, 3)[pixels]
+    near, points = lights.place[:, 3:], camera.points_at(pixels, height.reshape(-1)[pixels])
     return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre, view), lights.strength
 
 
@@ -190,10 +189,11 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
     """Return the fit by Gauss's and Newton's method, whose steps pixels take that they bring nearer, and the covariance [2, 2] of the turn.
     `turning`: whether the turn is fitted too. `place`: rows and columns of the pixels."""
     damped = np.full(len(fit.normal), 1e-3)
-    left = fit.left(sample)
+    seen = sample.lamps.seen(fit.turn)
+    left = fit.left(sample, seen)
     for number in range(ROUNDS):
         sides = _tangents(fit.normal)
-        by, by_turn = _slopes(sample, fit, left, sides)
+        by, by_turn = _slopes(sample, fit, seen, left, sides)
         weight = sample.weights(left)
         own = np.einsum("lpi,lp,lpj->pij", by, weight, by)
         own += np.einsum("p,pii,ij->pij", damped, own, np.eye(5)) + np.diag(HELD + 1e-9)
@@ -216,10 +216,9 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
     return fit, between_blocks(inverse, scores.sum(axis=0), *place) + inverse @ (of_lights.T @ of_lights) @ inverse
 
 
-def _slopes(sample: _Sample, fit: _Fit, left: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _slopes(sample: _Sample, fit: _Fit, seen: _Seen, left: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of the model by the parameters of each pixel, [lights, pixels, 5], and by the turn, [lights, pixels, 2]."""
     steps = [STEP * np.broadcast_to(unit, (len(fit.normal), 5)) for unit in np.eye(5)]
-    seen = sample.lamps.seen(fit.turn)
     own = [fit.moved(sides, step, np.zeros(2)).left(sample, seen) for step in steps]
     turned = [fit.moved(sides, np.zeros_like(steps[0]), STEP * unit).left(sample) for unit in np.eye(2)]
     return np.stack([(left - other) / STEP for other in own], axis=-1), np.stack([(left - other) / STEP for other in turned], axis=-1)

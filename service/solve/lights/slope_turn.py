@@ -119,9 +119,8 @@ def _looked_at(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: Nearn
     normal, perspective = normal.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64), camera.projection == "perspective"
     sway = np.zeros((3, 1, 1))
     if near is not None:
-        z = near.height[::step, ::step].astype(np.float64)
-        depth = -z if perspective else 1.0
-        sway = near.closeness * (np.stack([x * depth, y * depth, z]) - near.centre[:, None, None])
+        pixels = (row[:, None] * mask.shape[1] + col).reshape(-1)
+        sway = near.closeness * (camera.points_at(pixels, near.height.reshape(-1)[pixels]) - near.centre).T.reshape(3, *x.shape)
     return _Plane(normal, sway, inside, x, y, perspective, width, least)
 
 
