@@ -102,7 +102,7 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
                         "carrier_step": 2, "carrier_steps": 3, "offset_rad": -1.5707963},),
     UniformPattern: (_WHITE,),
     LaserRay: (_RAY,),
-    LaserPlane: ({"type": "plane", "point_m": [0.15, 0.0, 0.0], "normal": [1.0, 0.0, -0.2], "accuracy_deg": 0.05},),
+    LaserPlane: ({"type": "plane", "point_m": [0.15, 0.0, 0.0], "normal": [1.0, 0.0, -0.2], "accuracy_deg": 0.05, "accuracy_m": 0.0001},),
     ContinuousWave: (_CONTINUOUS,),
     Pulsed: ({"type": "pulsed", "bin_s": 9.1e-11, "start_s": -1e-9, "pulses": 100000, "first_photon_only": True, "count_scale": 10.0,
               "source_m": [0.02, 0.0, 0.0]},),

@@ -1,16 +1,16 @@
 """Calibration of the planes of a laser from poses of a target on which its stripes are seen: a chessboard, or a step of known height,
 which is a right-angled block on a flat base."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.status import Status
-from kernels.structured.stripe import find_stripe
+from kernels.structured.stripe import KNOWN_REACH, find_stripe
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.calibrate.solvers.charuco import Charuco, charuco_of, find_board
 from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, inside_board
@@ -31,10 +31,16 @@ from stage.stack.correction import Correction
 
 LEAST_BOARDS = 2
 """The fewest poses of a board: its stripe in one is a line, through which any plane goes."""
+LEAST_LINES = 10
+"""The fewest lines of the image on which a board shows a stripe: it counts as much as any other board."""
 LEAST_EVEN = 0.02
 """Part of the brightest light of the room below which a pixel says nothing of its albedo."""
 LARGEST_RESIDUAL_PX = 1.0
 """Largest root mean square distance of the lines of a stripe on a step from where the planes put them."""
+
+
+Along = Literal["row", "column"]
+ALONG: tuple[Along, ...] = ("row", "column")
 
 
 class LaserPlanes(NamedTuple):
@@ -52,6 +58,8 @@ class MeasuredPlane(NamedTuple):
 
     point: np.ndarray  # [3] metres
     normal: np.ndarray  # [3] unit
+    sigma_m: float
+    """Standard error of its place at the point, along the normal."""
     sigma_degrees: float
     facts: dict[str, float]
     """Entries of the report."""
@@ -118,7 +126,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
         except CalibrationError as error:
             raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
         planes.append(MeasuredPlane(
-            plane.point, plane.normal, plane.sigma_degrees,
+            plane.point, plane.normal, plane.sigma_m, plane.sigma_degrees,
             {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points},
             (f"{1000 * plane.residual_m:.3f} mm", f"{plane.points} points")))
     return _OnTarget(planes, {"boards": boards})
@@ -142,14 +150,12 @@ def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float,
     plane = board_plane(corners, board, square_m, capture.camera)
     inside = inside_board(corners, board, grey.shape)
     dark = np.float32(0) if black is None else black
-    found = []
     # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
     albedo = np.where(inside, np.maximum(grey, 0), 0).astype(np.float32)
-    for frame in _laser_frames(capture):
-        signal = stripe_signal(correction.apply(frame).pixels - dark, inside)
-        u, v, _ = max(_stripes(signal, albedo, device), key=lambda stripe: len(stripe[2]))
-        found.append(plane.meet(capture.camera, u, v))
-    return plane.rms_px, found
+    stripes = [_stripes(stripe_signal(correction.apply(frame).pixels - dark, inside), albedo, device) for frame in _laser_frames(capture)]
+    longer = [max(pair, key=lambda seen: len(seen.lines)) for pair in _whole(stripes, inside)]
+    return plane.rms_px, [plane.meet(capture.camera, *seen.image()) if len(seen.lines) >= LEAST_LINES else np.zeros((0, 3))
+                          for seen in longer]
 
 
 def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Timings) -> _OnTarget:
@@ -168,7 +174,7 @@ def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Ti
         raise CalibrationError(f"frame {_laser_frames(captures[0])[worst].image}: its stripe misses base, riser and top of an upright "
                                f"block by {fit.planes[worst].residual_px:.2g} px: look for light of other surfaces, a base that is not "
                                "flat, or a block that is not right-angled")
-    planes = [MeasuredPlane(plane.point, plane.normal, plane.sigma_degrees,
+    planes = [MeasuredPlane(plane.point, plane.normal, plane.sigma_m, plane.sigma_degrees,
                             {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"),
                              "sigma_depth": float(f"{plane.sigma:.3g}"), "poses": plane.stripes},
                             (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth")) for plane in fit.planes]
@@ -183,16 +189,15 @@ def _stripes_on_step(capture: Capture, device: str, pixel: float) -> list[StepSt
     correction, mask, frames = Correction.of(capture), capture.mask(), _laser_frames(capture)
     background, _ = ambient_light(capture, correction, frames, Timings(None))
     albedo = _step_albedo(capture, correction, mask)
+    stripes = [_stripes(stripe_signal(correction.apply(frame).pixels - background, mask), albedo, device) for frame in frames]
     found: list[StepStripe | None] = []
-    for frame in frames:
-        signal = stripe_signal(correction.apply(frame).pixels - background, mask)
+    for pair in _whole(stripes, mask):
         best: StepStripe | None = None
         most = 0
-        for u, v, lines in _stripes(signal, albedo, device):
-            x, y = capture.camera.plane_at(u, v)
-            parts = split_stripe(x, y, lines, pixel)
-            if parts is not None and len(lines) > most:
-                best, most = parts, len(lines)
+        for seen in pair:
+            parts = split_stripe(*capture.camera.plane_at(*seen.image()), seen.lines, pixel)
+            if parts is not None and len(seen.lines) > most:
+                best, most = parts, len(seen.lines)
         found.append(best)
     return found
 
@@ -207,14 +212,44 @@ def _step_albedo(capture: Capture, correction: Correction, mask: np.ndarray) -> 
     return np.maximum(grey, 0) if least > 0 and (grey[mask] > least).all() else None
 
 
-def _stripes(signal: Signal, albedo: np.ndarray | None, device: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the points of a stripe that is looked for along rows, then along columns: u, v and the number of the line of each, [n]."""
-    for along in ("row", "column"):
+class _Seen(NamedTuple):
+    """The points of a stripe that was looked for along rows or columns, one on each line that shows it."""
+
+    along: Along
+    lines: np.ndarray  # [n] number of the line
+    centre: np.ndarray  # [n] place on the line
+    width: np.ndarray  # [n] standard deviation of the profile, pixels
+
+    def image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image coordinates u and v, [n] each."""
+        across, down = self.centre.astype(np.float64), self.lines + 0.5
+        return (across, down) if self.along == "row" else (down, across)
+
+    def within(self, mask: np.ndarray, width: float) -> "_Seen":
+        """Return the points whose profile, of this width, lies in the mask: of one that is cut the middle is elsewhere than of what is
+        left."""
+        first, end = (np.floor(self.centre + reach * width).astype(int) for reach in (-KNOWN_REACH, KNOWN_REACH))
+        before = np.cumsum(np.pad(mask if self.along == "row" else mask.T, ((0, 0), (1, 0))), axis=1)  # pixels of the mask
+        most = before.shape[1] - 1
+        inside = before[self.lines, np.clip(end + 1, 0, most)] - before[self.lines, np.clip(first, 0, most)]
+        kept = inside == end + 1 - first
+        return _Seen(self.along, self.lines[kept], self.centre[kept], self.width[kept])
+
+
+def _stripes(signal: Signal, albedo: np.ndarray | None, device: str) -> list[_Seen]:
+    """Return a stripe as it is seen along rows, and along columns."""
+    found = []
+    for along in ALONG:
         stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)
-        centre, status = to_numpy(stripe.centre), to_numpy(stripe.status)
-        lines = np.flatnonzero(status == Status.OK)
-        across, down = centre[lines].astype(np.float64), lines + 0.5
-        yield (across, down, lines) if along == "row" else (down, across, lines)
+        lines = np.flatnonzero(to_numpy(stripe.status) == Status.OK)
+        found.append(_Seen(along, lines, to_numpy(stripe.centre)[lines], to_numpy(stripe.width)[lines]))
+    return found
+
+
+def _whole(stripes: list[list[_Seen]], mask: np.ndarray) -> list[list[_Seen]]:
+    """Return the stripes of all frames without points whose profile leaves the mask."""
+    widths = np.concatenate([seen.width for pair in stripes for seen in pair])
+    return [[seen.within(mask, float(np.median(widths))) for seen in pair] for pair in stripes] if len(widths) else stripes
 
 
 def _uniform(capture: Capture, correction: Correction, code: str) -> np.ndarray | None:
@@ -246,7 +281,8 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Pat
             if isinstance(frame.laser, LaserPlane):
                 plane = next(waiting)
                 (px, py, pz), (nx, ny, nz) = digits(plane.point), digits(plane.normal)
-                laser = LaserPlane(type="plane", point_m=(px, py, pz), normal=(nx, ny, nz))
+                laser = LaserPlane(type="plane", point_m=(px, py, pz), normal=(nx, ny, nz),
+                                   accuracy_deg=float(f"{plane.sigma_degrees:.3g}"), accuracy_m=float(f"{plane.sigma_m:.3g}"))
                 frame = frame.model_copy(update={"laser": laser})
             frames.append(frame)
         reports.append(write_results("laser-planes", request, target.manifest.model_copy(update={"frames": tuple(frames)}),

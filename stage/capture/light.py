@@ -140,8 +140,17 @@ class LaserPlane(Strict):
     normal: Direction
     """The normal of the plane in the camera frame, of either sign."""
     accuracy_deg: Positive | None = None
-    """The standard deviation of the plane's angle as it was calibrated, which the deviations of its depths then hold. None: it is not
-    known, and they hold that of the light alone."""
+    """The standard deviation of the plane's angle as it was calibrated, which the deviations of its depths then hold, as
+    `relit calibrate laser-planes` writes it. None: it is not known, and they hold that of the light alone."""
+    accuracy_m: Positive | None = None
+    """The standard deviation of the plane's place at point_m, along its normal, as it was calibrated: accuracy_deg is then that of a turn
+    about point_m. None: accuracy_deg is that of a turn about the plane's point nearest to the camera."""
+
+    @model_validator(mode="after")
+    def _both_accuracies(self) -> Self:
+        if self.accuracy_m is not None and self.accuracy_deg is None:
+            raise ValueError("accuracy_m: needs accuracy_deg beside it")
+        return self
 
 
 Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]

@@ -46,6 +46,8 @@ class LightPlane(NamedTuple):
     normal: np.ndarray  # [3] unit
     residual_m: float
     """Root mean square distance of the points, by the weights of the fit."""
+    sigma_m: float
+    """Standard error of its place at the point, along the normal."""
     sigma_degrees: float
     """Standard error of the tilt about the direction in which the stripes lie closest together."""
     points: int
@@ -108,7 +110,7 @@ def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
     if sigma > LARGEST_SIGMA_DEGREES:
         raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
                                "board towards the camera and away from it")
-    return LightPlane(middle, normal, residual, sigma, len(points))
+    return LightPlane(middle, normal, residual, max(noise, 1e-9) / math.sqrt(len(poses)), sigma, len(points))
 
 
 def _scatter(points: np.ndarray) -> float:

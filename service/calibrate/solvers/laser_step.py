@@ -37,6 +37,8 @@ class StepPlane(NamedTuple):
     normal: np.ndarray  # [3] unit
     residual_px: float
     """Root mean square distance of its lines from where the fit puts them."""
+    sigma_m: float
+    """Standard error of its place at the point, along the normal."""
     sigma_degrees: float
     """Standard error of the normal in its worst direction."""
     sigma: float
@@ -198,5 +200,6 @@ def _plane(data: _Data, values: np.ndarray, residual: np.ndarray, covariance: np
     lines = data.laser == number
     off = residual[:2 * len(data.face)].reshape(-1, 2)[lines] / data.weight[lines, None] / pixel
     middle = (rays * -depth[:, None] / rays[:, 2:]).mean(axis=0)
-    return StepPlane(middle, plane / length, math.sqrt(float((off**2).mean())), tilt, float(relative.max()),
+    place = math.sqrt(max(float(middle @ spread @ middle), 0.0)) / length
+    return StepPlane(middle, plane / length, math.sqrt(float((off**2).mean())), place, tilt, float(relative.max()),
                      len(np.unique(data.pose[lines])))

@@ -186,6 +186,8 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
     spread = spread_px * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
     if laser.accuracy_deg:
         spread = np.hypot(spread, np.radians(laser.accuracy_deg) * depth_per_turn(x, y, met.depth, laser))
+        if laser.accuracy_m:
+            spread = np.hypot(spread, laser.accuracy_m * _depth_per_shift(x, y, laser))
     return Stripes(StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), peak, code), chosen.curve,
                    int(chosen.doubled.sum()), int(chosen.second.sum()))
 
@@ -256,13 +258,24 @@ def _beside(values: np.ndarray, lines: int) -> np.ndarray:
 # Stripes across the rows and stripes across the columns see the same surfaces, and do.
 
 def depth_per_turn(x: np.ndarray, y: np.ndarray, depth: np.ndarray, laser: LaserPlane) -> np.ndarray:
-    """Return the change of the depths of points on a plane for each radian by which it turns about its point nearest to the camera, where
-    the laser is about; metres, for the axis that makes most of it."""
+    """Return the change of the depths of points on a plane for each radian by which it turns, metres, for the axis that makes most of it.
+
+    A plane whose place is declared to be known at its point turns about that, others about the point nearest to the camera, where the
+    laser is about.
+    """
+    point = np.array(laser.point_m)
+    if laser.accuracy_m is None:
+        normal = np.array(laser.normal) / np.linalg.norm(laser.normal)
+        point = normal * (point @ normal)
+    away = np.stack([x * depth, y * depth, -depth], axis=-1) - point
+    return np.asarray(np.linalg.norm(away, axis=-1) * _depth_per_shift(x, y, laser))
+
+
+def _depth_per_shift(x: np.ndarray, y: np.ndarray, laser: LaserPlane) -> np.ndarray:
+    """Return the change of the depths of points on a plane for each metre by which it moves along its normal."""
     normal = np.array(laser.normal) / np.linalg.norm(laser.normal)
-    foot = normal * np.dot(laser.point_m, normal)
-    away = np.stack([x * depth, y * depth, -depth], axis=-1) - foot
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.linalg.norm(away, axis=-1) / np.abs(x * normal[0] + y * normal[1] - normal[2]))
+    with np.errstate(divide="ignore"):
+        return np.asarray(1 / np.abs(x * normal[0] + y * normal[1] - normal[2]))
 
 
 def unconfirmed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> str | None:
