@@ -1,6 +1,7 @@
-"""Calibration of a time-of-flight camera from a sweep over known distances: wiggling, scale, offset and drift."""
+"""Calibration of a time-of-flight camera from a sweep over known distances: wiggling, scale, offset and drift, how far they are known, and
+what the sweep says of its own distances."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +10,8 @@ import numpy as np
 from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.tof.continuous.continuous import decode
+from service.calibrate.results import digits, write_report
+from service.calibrate.solvers.tof_sweep import Fit, StepPhases, all_readings, contradicting, fit_steps, fit_wiggling, target_faults
 from service.depth.tof.continuous_wave import estimate_noise
 from service.depth.tof.tof import solve_tof, z_per_range
 from service.errors import RequestError
@@ -16,9 +19,10 @@ from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture.capture import Capture
+from stage.errors import CalibrationError
 from stage.files import resolved
+from stage.spread import MAD_TO_SIGMA
 from stage.tof.calibration import (
-    Harmonics,
     Sweep,
     SweepDistance,
     TofCalibration,
@@ -28,6 +32,7 @@ from stage.tof.calibration import (
     read_sweep,
     write_calibration,
 )
+from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.raw_frames import is_pulsed, read_correlations, read_source
 from stage.tof.source import SourcePath
 
@@ -35,6 +40,14 @@ STEP_PIXELS = 400
 """Pixels of each step, evenly chosen: more do not improve the harmonics, which the number of steps limits."""
 SHARPEST_RAD = 0.3
 """Largest standard deviation of a phase that takes part in the fit, radians."""
+MOST_SCATTER = 0.15
+"""Scatter of the errors of ranges, as a part of what the highest frequency tells apart, beyond which no wiggling makes them."""
+MOST_WRONG = 0.2
+"""Largest part of the steps that is left out."""
+FEWEST = 5
+"""Fewest steps of which one can contradict the others."""
+DETERMINED = 0.5
+"""Error at a distance that is left out, as a part of that without a calibration, above which more distances are needed."""
 
 
 class TofCalibrationResult(NamedTuple):
@@ -42,19 +55,22 @@ class TofCalibrationResult(NamedTuple):
 
     calibration: TofCalibration
     path: Path
+    report_path: Path
     before_m: float
     """RMS of the steps' median errors without the calibration."""
     after_m: float
     """RMS of the same errors with the calibration that was made from them."""
     steps: int
+    """The number of steps that were used."""
+    warnings: tuple[str, ...]
 
 
 def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = None, *,
                   allowed: Sequence[Path] | None = None) -> TofCalibrationResult:
-    """Calibrate a time-of-flight camera, and write the calibration.
+    """Calibrate a time-of-flight camera, and write the calibration, with calibration.json beside it.
     `allowed`: folders of the captures that the sweep may name; None: any. Raises StageError or KernelError if a capture or the sweep cannot
     be used, or does not determine the calibration; nothing is written. Raises RequestError if steps of both kinds, a step without a solved
-    pixel, or a capture that is not allowed."""
+    pixel, distances that are not those of the captures, or a capture that is not allowed."""
     timings = Timings(progress)
     device, sweep = devices.resolve(request.device), request.sweep
     plan = read_sweep(sweep)
@@ -63,21 +79,24 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
     plain = _range_errors(plan, captures, None, device, timings)
-    if kinds == {True}:
-        known: dict[str, Any] = _scale_and_offset(plan, captures, plain)
-    else:
-        known = _harmonics(plan, captures, device, timings)
-    calibration = TofCalibration.model_validate(known)
-    after = _range_errors(plan, captures, calibration, device, timings)
+    found = _fit_line(plan, captures, plain) if kinds == {True} else _fit_wiggling(plan, captures, plain, device, timings)
+    calibration = TofCalibration.model_validate({
+        **found.known, "sigma_m": None if found.sigma_m is None else float(f"{found.sigma_m:.3g}")})
+    after = _range_errors(plan, captures, calibration, device, timings, told=found.warnings)
+    used = np.isin(np.arange(len(captures)), found.left_out, invert=True)
     if plan.has_drift:
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
-        drift, level = fit_temperature(after, warm)
-        calibration = TofCalibration.model_validate({**known, "temperature": drift, "offset_m": calibration.offset_m + level})
+        drift, level = fit_temperature(after[used], warm[used])
+        calibration = calibration.model_copy(update={"temperature": drift, "offset_m": calibration.offset_m + level})
         after = after - level - drift.metres_per_c * (warm - drift.reference_c)
     write_calibration(calibration, request.out)
+    report = write_report("tof", request, request.out.parent, {
+        "steps": [{"capture": step.capture, "depth_m": step.depth_m, "error_m": error, "used": bool(kept)}
+                  for step, error, kept in zip(plan.steps, digits(after), used, strict=True)],
+        "sigma_m": calibration.sigma_m, "warnings": list(found.warnings)})
     timings.close()
-    before_m, after_m = (float(np.sqrt(np.mean(errors**2))) for errors in (plain, after))
-    return TofCalibrationResult(calibration, request.out, before_m, after_m, len(plan.steps))
+    before_m, after_m = (float(np.sqrt(np.mean(errors[used] ** 2))) for errors in (plain, after))
+    return TofCalibrationResult(calibration, request.out, report, before_m, after_m, int(used.sum()), found.warnings)
 
 
 def _folder(sweep: Path, step: SweepDistance, allowed: Sequence[Path] | None) -> Path:
@@ -91,13 +110,16 @@ def _folder(sweep: Path, step: SweepDistance, allowed: Sequence[Path] | None) ->
     return found
 
 
-def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
-    """Return [steps] the median of measured less true half path of light, metres."""
+def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings, *,
+                  told: tuple[str, ...] = ()) -> np.ndarray:
+    """Return [steps] the median of measured less true half path of light, metres. `told`: what is known to be wrong with the sweep."""
     errors = []
     for step, capture in zip(plan.steps, captures, strict=True):
         solved = solve_tof(capture, TofOptions(), calibration=calibration, device=device, timings=timings)
         if not solved.solved.any() or solved.range_m is None:
-            raise RequestError(f"{capture.folder}: no pixel of this step is solved: check its frames and its mask")
+            given = "" if calibration is None else " with the calibration that the distances give"
+            raise RequestError(f"{capture.folder}: no pixel of this step is solved{given}: "
+                               f"{'; '.join(told) or 'check its frames and its mask'}")
         off = _half_path(solved.range_m.astype(np.float64), capture) - _true_half_path(step, capture)
         errors.append(float(np.median(off[solved.solved])))
     return np.array(errors)
@@ -113,22 +135,97 @@ def _half_path(range_m: np.ndarray, capture: Capture) -> np.ndarray:
     return range_m if path is None else path.half_path_m(range_m)
 
 
-def _scale_and_offset(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
-    """Return scale and offset, fitted to the median half paths of the steps."""
+class _Found(NamedTuple):
+    """What a sweep gives."""
+
+    known: dict[str, Any]
+    """Entries of the calibration."""
+    sigma_m: float | None
+    """The standard deviation of ranges that it leaves open; None: the steps are too few to tell."""
+    left_out: list[int]
+    """The steps whose distances contradict the others."""
+    warnings: tuple[str, ...]
+
+
+def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Found:
+    """Fit scale and offset to the median half paths of the steps."""
     true = np.array([float(np.median(_true_half_path(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
-    scale, offset = fit_line(true + errors, true)
-    return {"scale": scale, "offset_m": offset}
+    measured = true + errors
+
+    def off(steps: list[int]) -> Fit:
+        return fit_steps([np.array([[measured[step], 1.0]]) for step in steps], [true[step:step + 1] for step in steps])
+
+    kept, left_out, warnings = _consistent(plan, errors, range(len(captures)), lambda steps: -off(steps).scatter)
+    scale, offset = fit_line(measured[kept], true[kept])
+    return _Found({"scale": scale, "offset_m": offset}, off(kept).sigma if len(kept) > 2 else None, left_out, warnings)
 
 
-def _harmonics(plan: Sweep, captures: list[Capture], device: str, timings: Timings) -> dict[str, Any]:
-    """Return the harmonics of each frequency, fitted to the steps at the commonest temperature."""
-    chosen = [(step, capture) for step, capture in zip(plan.steps, captures, strict=True)
-              if step.temperature_c == plan.commonest_temperature_c]
+def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, device: str, timings: Timings) -> _Found:
+    """Fit the harmonics of each frequency to the steps at the commonest temperature."""
+    chosen = [number for number, step in enumerate(plan.steps) if step.temperature_c == plan.commonest_temperature_c]
+    phases = _phases(plan, captures, chosen, device, timings)
+    if not phases:
+        raise CalibrationError(f"steps: no phase is known to {SHARPEST_RAD:g} radians: take a brighter target, or more frames of each step")
+    highest = max(phases)  # the surest, on which ranges rest
+    per_radian = SPEED_OF_LIGHT / (4 * np.pi * highest)
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(errors - np.median(errors))))
+    if scatter > MOST_SCATTER * 2 * np.pi * per_radian:
+        raise RequestError(f"steps: measured ranges differ from the declared distances by {scatter:.2g} m more at some than at others, "
+                           "which is no wiggling: check depth_m, its unit, and the order of the captures")
+
+    def some(hz: float, steps: Iterable[int]) -> list[StepPhases]:
+        return [phases[hz][step] for step in steps if step in phases[hz]]
+
+    turn = target_faults(some(highest, phases[highest]), highest).turn
+    phases = {hz: {step: readings.turned(turn) for step, readings in own.items()} for hz, own in phases.items()}
+    kept, left_out, warnings = _consistent(plan, errors, phases[highest],
+                                           lambda steps: fit_wiggling(some(highest, steps), highest).scatter * per_radian)
+    if turn.any():
+        axis, degrees = max(zip(("upright", "level"), np.degrees(np.arctan(np.abs(turn))), strict=True), key=lambda each: each[1])
+        warnings = (*warnings, f"steps: the target does not face the camera: it is turned by {degrees:.2g}° about the {axis} axis in all "
+                               "of them, which is taken out")
+    scale = target_faults(some(highest, kept), highest).scale
+    tables = tuple(fit_harmonics(*all_readings(some(hz, kept)), hz) for hz in phases)
+    sigma = fit_wiggling(some(highest, kept), highest).sigma * per_radian
+    if sigma > DETERMINED * errors[kept].std():
+        warnings = (*warnings, f"steps: ranges at a distance that is left out are off by {sigma:.2g} m, and by {errors[kept].std():.2g} m "
+                               "without a calibration: measure at more distances")
+    if scale is not None:
+        reach = float(np.median([plan.steps[step].depth_m for step in kept]))
+        sigma = float(np.hypot(sigma, (scale - 1) * reach))
+        warnings = (*warnings, f"steps: all distances look {scale:.4f} times too long beside the phases: check depth_m and "
+                               f"modulation_hz; ranges are {abs(scale - 1) * reach:.2g} m off with it")
+    return _Found({"harmonics": tables}, sigma, left_out, warnings)
+
+
+def _consistent(plan: Sweep, errors: np.ndarray, steps: Iterable[int], fitted: Callable[[list[int]], np.ndarray]
+                ) -> tuple[list[int], list[int], tuple[str, ...]]:
+    """Leave out steps that contradict the others, one after the other: by far more than wiggling, then by far more than what a fit leaves.
+    `errors`: [steps] metres, without a calibration. `fitted`: returns what a fit to some steps leaves of each, metres. Returns the steps
+    that are kept, those that are not, and what is to be said."""
+    kept, left_out, warnings = list(steps), list[int](), tuple[str, ...]()
+    for off in (lambda some: errors[some], fitted):
+        most = int(MOST_WRONG * (len(kept) + len(left_out)))
+        while len(kept) > FEWEST and len(left_out) < most:
+            away = off(kept)
+            worst = contradicting(away)
+            if worst is None:
+                break
+            wrong = plan.steps[kept[worst]]
+            warnings = (*warnings, f"steps: the depth_m of {wrong.capture}, {wrong.depth_m:g} m, contradicts the others by "
+                                   f"{abs(away[worst] - np.median(away)):.2g} m, and is left out")
+            left_out.append(kept.pop(worst))
+    return kept, left_out, warnings
+
+
+def _phases(plan: Sweep, captures: list[Capture], chosen: list[int], device: str, timings: Timings
+            ) -> dict[float, dict[int, StepPhases]]:
+    """Return the phases of some steps at each frequency."""
     timings.stage("wiggling", len(chosen))
-    phases: dict[float, list[np.ndarray]] = {}
-    ranges: dict[float, list[np.ndarray]] = {}
-    for done, (step, capture) in enumerate(chosen, start=1):
+    phases: dict[float, dict[int, StepPhases]] = {}
+    for done, number in enumerate(chosen, start=1):
+        step, capture = plan.steps[number], captures[number]
         frames = read_correlations(capture)
         inside = np.nonzero(capture.mask().reshape(-1))[0]
         some = inside[np.linspace(0, len(inside) - 1, min(STEP_PIXELS, len(inside))).astype(int)]
@@ -137,11 +234,12 @@ def _harmonics(plan: Sweep, captures: list[Capture], device: str, timings: Timin
         found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise,
                        saturation=capture.manifest.saturation, scale=frames.scale, device=device)
         true = _true_half_path(step, capture).reshape(-1)[some]
+        aside = np.stack(capture.camera.plane_coordinates(), axis=-1).reshape(-1, 2)[some]
         phase, sigma = to_numpy(found.phase)[:, some], to_numpy(found.sigma)[:, some]
         for row, hz in enumerate(found.modulation_hz.tolist()):
             good = (sigma[row] > 0) & (sigma[row] < SHARPEST_RAD)
-            phases.setdefault(hz, []).append(phase[row, good].astype(np.float64))
-            ranges.setdefault(hz, []).append(true[good])
+            if good.any():
+                phases.setdefault(hz, {})[number] = StepPhases(phase[row, good].astype(np.float64), true[good], aside[good],
+                                                                   capture.camera.projection == "perspective")
         timings.advance(done)
-    tables: list[Harmonics] = [fit_harmonics(np.concatenate(phases[hz]), np.concatenate(ranges[hz]), hz) for hz in phases]
-    return {"harmonics": tuple(tables)}
+    return phases

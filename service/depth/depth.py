@@ -194,13 +194,15 @@ def _tell_shared_error(solution: DepthSolution, capture: Capture, using: Ranging
     elif using is Ranging.STEREO:
         part = max(other.depth_sigma or 0.0 for other in manifest.other_cameras)
     solved = solution.solved
-    if not part or solution.sigma is None or not solved.any():
+    if solution.sigma is None or not solved.any():
         return
-    shared, own = part * float(np.median(solution.depth[solved])), float(np.median(solution.sigma[solved]))
-    solution.facts["calibration_sigma_m"] = float(f"{shared:.3g}")
+    middle, own = float(np.median(solution.depth[solved])), float(np.median(solution.sigma[solved]))
+    if part:
+        solution.facts["calibration_sigma_m"] = float(f"{part * middle:.3g}")
+    shared = solution.facts.get("calibration_sigma_m", 0.0)
     if shared > own:
-        field = "projector" if using is Ranging.PATTERN else "other_cameras[]"
-        solution.warnings.append(f"{field}.depth_sigma: the calibration leaves {100 * part:.2g} % of depths open, {shared:.3g} m at the "
+        field = {Ranging.PATTERN: "projector.depth_sigma", Ranging.STEREO: "other_cameras[].depth_sigma"}.get(using, "--tof-calibration")
+        solution.warnings.append(f"{field}: the calibration leaves {100 * shared / middle:.2g} % of depths open, {shared:.3g} m at the "
                                  f"median: {shared / own:.2g} standard deviations of a pixel, which do not hold what all pixels share")
 
 

@@ -21,6 +21,10 @@ SWEEP_PART = 0.5
 """The part of a period that a sweep must cover: a table from less would be extrapolated over most of the period."""
 
 
+LEAST_TERM = 1e-6
+"""Singular values of the terms below this part of the largest are none: phases that no distance shows leave them open."""
+
+
 class Harmonics(Strict):
     """The wiggling at one frequency: the error of a measured phase φ is Σ cos[h]·cos hφ + sin[h]·sin hφ over the harmonics h."""
 
@@ -72,6 +76,8 @@ class TofCalibration(Strict):
     offset_m: float = 0.0
     """True range = scale · measured - offset_m - temperature drift."""
     temperature: Temperature | None = None
+    sigma_m: NotNegative | None = None
+    """The standard deviation of ranges that the calibration leaves open and all pixels share; None: it is not known."""
     pulse_sigma_s: Positive | None = None
     """The standard deviation of a Gaussian pulse, including the jitter of the detector."""
     pulse: PulseShape | None = None
@@ -131,13 +137,22 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
     if covered < SWEEP_PART:
         raise CalibrationError(f"the sweep covers {100 * covered:.0f} % of a turn at {modulation_hz / 1e6:g} MHz: "
                                f"go over {100 * SWEEP_PART:.0f} % or more, {SPEED_OF_LIGHT / (2 * modulation_hz):.3g} m are a whole one")
-    error = phase_rad - 4 * np.pi * modulation_hz / SPEED_OF_LIGHT * range_m
-    centre = np.angle(np.exp(1j * error).mean())  # so that an offset near half a period does not wrap
-    error = centre + np.angle(np.exp(1j * (error - centre)))
-    angle = phase_rad[:, None] * np.arange(HARMONICS + 1)
-    matrix = np.concatenate([np.cos(angle), np.sin(angle[:, 1:])], axis=1)
-    found = np.linalg.lstsq(matrix, error, rcond=1e-6)[0]
+    found = np.linalg.lstsq(harmonic_terms(phase_rad), phase_errors(phase_rad, range_m, modulation_hz), rcond=LEAST_TERM)[0]
     return Harmonics(modulation_hz=modulation_hz, cos=tuple(found[: HARMONICS + 1].tolist()), sin=(0.0, *found[HARMONICS + 1 :].tolist()))
+
+
+def harmonic_terms(phase_rad: np.ndarray) -> np.ndarray:
+    """Return the terms of the wiggling at phases [n], radians: [n, terms], those of the cosine from 0 on, those of the sine from 1 on."""
+    angle = phase_rad[:, None] * np.arange(HARMONICS + 1)
+    return np.concatenate([np.cos(angle), np.sin(angle[:, 1:])], axis=1)
+
+
+def phase_errors(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float) -> np.ndarray:
+    """Return by how much phases [n] differ from those of true ranges [n]: radians about the mean of all, so that an offset near half a
+    period does not wrap."""
+    error = phase_rad - 4 * np.pi * modulation_hz / SPEED_OF_LIGHT * range_m
+    centre = np.angle(np.exp(1j * error).mean())
+    return np.asarray(centre + np.angle(np.exp(1j * (error - centre))))
 
 
 def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:

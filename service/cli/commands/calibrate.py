@@ -112,12 +112,16 @@ def _response(result: Any) -> None:
 
 def _tof(result: Any) -> None:
     print(f"file     {result.path}")
+    print(f"report   {result.report_path}")
     drift = result.calibration.temperature
     found = [f"wiggling at {harmonics.modulation_hz / 1e6:g} MHz" for harmonics in result.calibration.harmonics]
     found += [f"scale {result.calibration.scale:.5g}", f"offset {1000 * result.calibration.offset_m:.2f} mm"]
     found += [] if drift is None else [f"drift {1000 * drift.metres_per_c:.3f} mm a degree"]
     print(f"found    {', '.join(found)}")
     print(f"error    {1000 * result.before_m:.2f} mm before, {1000 * result.after_m:.2f} mm after, RMS over {result.steps} steps")
+    if result.calibration.sigma_m is not None:
+        print(f"sure to  {1000 * result.calibration.sigma_m:.2f} mm")
+    print_warnings(result.warnings)
 
 
 def _rig(result: Any) -> None:

@@ -70,6 +70,8 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         found = solve_correlations(correlations, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit, usable=mask,
                                    device=device)
     found = _scattered(_corrected(found, options, calibration, path, near_m, far_m), mask)
+    if calibration.sigma_m is not None:
+        found = replace(found, facts=found.facts | {"calibration_sigma_m": calibration.sigma_m})
     return _depth_of(found, options, capture.camera, mask, device=device, timings=timings)
 
 

@@ -19,14 +19,15 @@ SETTINGS = tof.even(tof.HZ, 4)
 WAVES = {3: 0.08, 5: -0.02}
 
 
-def wall(depth_m: float, shift_m: float = 0.0) -> tof.View:
+def wall(depth_m: float, shift_m: float = 0.0, turn: float = 0.0) -> tof.View:
+    """A wall, turned about the upright axis by an angle of this tangent."""
     x, y = Camera.model_validate(CAMERA).plane_coordinates()
-    return tof.View(depth_m * np.sqrt(x**2 + y**2 + 1) + shift_m, np.full((ROWS, COLS), 0.8), np.ones((ROWS, COLS)))
+    return tof.View(depth_m / (1 - turn * x) * np.sqrt(x**2 + y**2 + 1) + shift_m, np.full((ROWS, COLS), 0.8), np.ones((ROWS, COLS)))
 
 
-def sweep(folder, steps, frames):
+def sweep(folder, steps, frames, turn=0.0):
     for name, depth_m, shift_m, _ in steps:
-        write(folder / name, frames(wall(depth_m, shift_m)), camera=CAMERA)
+        write(folder / name, frames(wall(depth_m, shift_m, turn)), camera=CAMERA)
     entries = [{"capture": name, "depth_m": depth_m, **({} if warm is None else {"temperature_c": warm})}
                for name, depth_m, _, warm in steps]
     (folder / "sweep.json").write_text(json.dumps({"schema": "relit.tof-sweep/1", "steps": entries}))
@@ -55,12 +56,59 @@ def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
 
 
 @pytest.mark.long
+def test_distances_that_contradict_the_others_and_a_turned_target_are_said_and_taken_out(tmp_path, relit):
+    """A target turned by 5°, and one distance of 25 that is declared 3 cm too long: as good as a right sweep, which leaves 1.5 mm."""
+    steps = [(f"d{k}", depth, 0.04, None) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))]
+    path = sweep(tmp_path, steps, cw, turn=np.tan(np.radians(5)))
+    plan = json.loads(path.read_text())
+    plan["steps"][12]["depth_m"] += 0.03
+    path.write_text(json.dumps(plan))
+    outcome = relit("calibrate", "tof", path, "--out", tmp_path / "camera.json", "--device", "cpu")
+    assert outcome.code == 0 and "d12" in outcome.out and "5° about the upright axis" in outcome.out, outcome.out
+    report = json.loads((tmp_path / "calibration.json").read_text())["tof"]
+    assert [step["capture"] for step in report["steps"] if not step["used"]] == ["d12"] and len(report["warnings"]) == 2
+    folder = write(tmp_path / "new", cw(wall(3.3, 0.04)), camera=CAMERA)
+    _, maps, said = run(folder, calibration=tmp_path / "camera.json")
+    assert maps.mask.mean() > 0.99 and abs(np.median(maps.depth[maps.mask]) - 3.3) < 2e-3
+    assert said["found"]["calibration_sigma_m"] == read_calibration(tmp_path / "camera.json").sigma_m < 1e-3
+
+
+@pytest.mark.long
+def test_distances_in_another_unit_or_scale_are_told(tmp_path, relit):
+    steps = [(f"d{k}", depth, 0.0, None) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))]
+    path = sweep(tmp_path, steps, cw)
+    plan = json.loads(path.read_text())
+
+    def scaled(factor):
+        path.write_text(json.dumps({**plan, "steps": [{**step, "depth_m": factor * step["depth_m"]} for step in plan["steps"]]}))
+        return relit("calibrate", "tof", path, "--out", tmp_path / "camera.json", "--device", "cpu")
+
+    outcome = scaled(1.005)
+    assert outcome.code == 0 and "1.0050 times too long" in outcome.out
+    folder = write(tmp_path / "new", cw(wall(3.3)), camera=CAMERA)
+    _, maps, report = run(folder, calibration=tmp_path / "camera.json")
+    assert 0.5 < abs(np.median(maps.depth[maps.mask]) - 3.3) / report["found"]["calibration_sigma_m"] < 1.5
+    assert any("--tof-calibration" in words for words in report["warnings"])
+    before = (tmp_path / "camera.json").read_bytes()
+    outcome = scaled(100)
+    assert outcome.code == 2 and "check depth_m, its unit" in outcome.err
+    outcome = scaled(1.05)
+    assert outcome.code == 2 and "times too long" in outcome.err
+    assert (tmp_path / "camera.json").read_bytes() == before
+
+
+@pytest.mark.long
 def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 6))]
     path = sweep(tmp_path, steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
     result = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
     assert result.before_m > 0.05 and result.after_m < 2e-3
     assert result.calibration.offset_m == pytest.approx(0.05, abs=0.01)
+    assert result.calibration.sigma_m is not None and result.calibration.sigma_m < 3e-3 and not result.warnings
+    plan = json.loads(path.read_text())
+    plan["steps"][2]["depth_m"] += 0.2
+    path.write_text(json.dumps(plan))
+    assert "d2" in calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu")).warnings[0]
 
 
 @pytest.mark.parametrize(("steps", "message"), [

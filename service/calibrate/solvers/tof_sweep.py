@@ -1,0 +1,142 @@
+"""Fits to a flat target at known distances without each distance in turn: how far the calibration of a time-of-flight camera is known, and
+which distances contradict the others.
+
+The pixels of one distance err alike, so that a fit to all pixels would be sure of anything: what the other distances say of one tells how
+far a calibration is known between its distances.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.spread import MAD_TO_SIGMA
+from stage.tof.calibration import LEAST_TERM, harmonic_terms, phase_errors
+from stage.tof.light_time import SPEED_OF_LIGHT
+
+LEAST_TURNS = 1.5
+"""The least part of a period over which distances that are all too long by a part of them are no wiggling."""
+SURE = 4.0
+"""Standard errors beyond which a turn of the target or a scale of its distances is one, and a distance contradicts the others."""
+LEAST_TURN, LEAST_SCALE = 0.005, 5e-4
+"""The least tangent of a turn of the target, 0.3 degrees, and the least part by which all distances are too long."""
+ROUNDS = 3
+"""Fits of the turn, whose effect on ranges is not linear."""
+FOLLOWED = 0.1
+"""Squares that a fit leaves, over those of the fits without each step, below which it follows every step."""
+SETTLED_M = 1e-3
+"""Scatter of distances below which none contradicts the others."""
+
+
+class StepPhases(NamedTuple):
+    """The phases of one frequency at one distance of the target."""
+
+    phase: np.ndarray  # [n] radians, measured
+    range_m: np.ndarray  # [n] true
+    aside: np.ndarray  # [n, 2] where the line of sight meets the plane at depth 1; orthographic: at any depth, metres
+    perspective: bool = True
+
+    def turned(self, turn: np.ndarray) -> "StepPhases":
+        """Return the phases with the ranges of a target that is turned: [2] tangents, about the upright and the level axis."""
+        nearer = self.aside @ turn
+        return self._replace(range_m=self.range_m / (1 - nearer) if self.perspective else self.range_m + nearer)
+
+    def per_turn(self, turn: np.ndarray) -> np.ndarray:
+        """Return the change of the ranges of a target that is turned, [n, 2] metres for a tangent."""
+        return self.aside * (self.range_m / (1 - self.aside @ turn) ** 2)[:, None] if self.perspective else self.aside
+
+
+def all_readings(steps: Sequence[StepPhases]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the phases and the true ranges of all steps, [n] each."""
+    return np.concatenate([step.phase for step in steps]), np.concatenate([step.range_m for step in steps])
+
+
+class Fit(NamedTuple):
+    """A linear fit to steps of readings."""
+
+    values: np.ndarray  # [unknowns]
+    spread: np.ndarray  # [unknowns] standard errors by the jackknife over the steps
+    left: np.ndarray  # [steps] mean of the readings of each step less the fit
+    left_out: np.ndarray  # [steps] the same for a fit without the step
+
+    @property
+    def scatter(self) -> np.ndarray:
+        """What the steps are off, [steps], of equal variance: √(left · left_out) has that of a step's own error.
+
+        Zeros where the fit follows each step, so that none can contradict the others.
+        """
+        told = np.sum(self.left**2) > FOLLOWED * np.sum(self.left_out**2)
+        return np.asarray(np.sqrt(np.maximum(self.left * self.left_out, 0)) * np.sign(self.left) * told)
+
+    @property
+    def sigma(self) -> float:
+        """The standard deviation of the fit at a step that it does not know: that by which leaving steps out moves it."""
+        return float(np.sqrt(max(np.mean(self.left_out * (self.left_out - self.left)), 0.0)))
+
+
+def fit_steps(matrices: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Fit:
+    """Fit matrices [n, unknowns] of steps to their readings [n] by least squares, and without each step in turn."""
+    parts = [np.linalg.qr(np.column_stack([matrix, target])) for matrix, target in zip(matrices, targets, strict=True)]
+    rows = [part.R for part in parts]  # a step's readings as no more rows than unknowns
+    middles = np.array([np.append(matrix.mean(axis=0), target.mean()) for matrix, target in zip(matrices, targets, strict=True)])
+
+    def solved(own: Sequence[np.ndarray]) -> np.ndarray:
+        all_rows = np.concatenate(own)
+        return np.asarray(np.linalg.lstsq(all_rows[:, :-1], all_rows[:, -1], rcond=LEAST_TERM)[0])
+
+    values = solved(rows)
+    without = np.array([solved([*rows[:step], *rows[step + 1:]]) for step in range(len(rows))])
+    count = len(rows)
+    spread = np.sqrt((count - 1) * without.var(axis=0))
+    left = middles[:, -1] - middles[:, :-1] @ values
+    return Fit(values, spread, left, middles[:, -1] - (middles[:, :-1] * without).sum(axis=1))
+
+
+def fit_wiggling(steps: Sequence[StepPhases], modulation_hz: float) -> Fit:
+    """Fit the harmonics of one frequency to phases that were measured at known distances, in radians, as `fit_harmonics` does to all at
+    once."""
+    return fit_steps([harmonic_terms(step.phase) for step in steps], _errors(steps, modulation_hz))
+
+
+class TargetFaults(NamedTuple):
+    """What the phases say of how a target was placed."""
+
+    turn: np.ndarray  # [2] tangents of the turn about the upright and the level axis; 0 where it is not sure
+    scale: float | None
+    """Declared distances over true ones; None: not sure to differ from 1."""
+
+
+def target_faults(steps: Sequence[StepPhases], modulation_hz: float) -> TargetFaults:
+    """Return by how much the target is turned in all steps, and by which factor all distances are declared too long: neither repeats with
+    the phase as wiggling does. `modulation_hz`: the highest, whose phases are the surest."""
+    metre = 4 * np.pi * modulation_hz / SPEED_OF_LIGHT
+    reach = metre * np.ptp([np.median(step.range_m) for step in steps]) / (2 * np.pi)
+    turn, sure = np.zeros(2), np.zeros(3, bool)
+    too_long = 0.0
+    for _ in range(ROUNDS):
+        placed = [step.turned(turn) for step in steps]
+        columns = [metre * np.column_stack([step.per_turn(turn), *([own.range_m] if reach > LEAST_TURNS else [])])
+                   for step, own in zip(steps, placed, strict=True)]
+        fit = fit_steps([np.column_stack([harmonic_terms(step.phase), own]) for step, own in zip(steps, columns, strict=True)],
+                        _errors(placed, modulation_hz))
+        count = columns[0].shape[1]
+        found, spread = fit.values[-count:], fit.spread[-count:]
+        turn = turn + found[:2]
+        sure[:count] = np.abs([*turn, *found[2:]]) > SURE * spread
+        too_long = float(1 / (1 + found[2]) - 1) if count > 2 else 0.0
+    return TargetFaults(np.where(sure[:2] & (np.abs(turn) > LEAST_TURN), turn, 0.0),
+                        1 + too_long if sure[2] and abs(too_long) > LEAST_SCALE else None)
+
+
+def contradicting(off_m: np.ndarray) -> int | None:
+    """Return the number of the step that is off by far more than the others, [steps] metres; None if none is."""
+    away = np.abs(off_m - np.median(off_m))
+    scatter = max(MAD_TO_SIGMA * float(np.median(away)), SETTLED_M)
+    worst = int(away.argmax())
+    return worst if away[worst] > 1.5 * SURE * scatter else None
+
+
+def _errors(steps: Sequence[StepPhases], modulation_hz: float) -> list[np.ndarray]:
+    """Return by how much the phases of each step differ from those of its ranges, radians about one mean."""
+    errors = phase_errors(*all_readings(steps), modulation_hz)
+    return np.split(errors, np.cumsum([len(step.phase) for step in steps])[:-1])
