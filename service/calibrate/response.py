@@ -1,8 +1,8 @@
 """Calibration of a projector's response (its light at each level, its gamma) from images of uniformly grey projections.
 
 A camera pixel reads ambient + s · g(level) with an ambient light and a scale s of its own and one response g for all pixels. Relative
-to the darkest and the brightest image every pixel gives g directly; the response is the median over the pixels that see the projector
-well. A monotonic least-squares fit and interpolation to even levels follow.
+to the darkest and the brightest image every pixel gives g directly; the response is the mean over the pixels that see the projector
+well, by how much of its light each reads. A monotonic least-squares fit and interpolation to even levels follow.
 
 Source: Ayer et al., "An empirical distribution function for sampling with incomplete information", Annals of Mathematical Statistics
     26(4), 1955 (pool adjacent violators).
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 
 from service.calibrate.results import digits, open_capture, write_results
+from service.calibrate.solvers.response_faults import response_faults
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import ResponseRequest
@@ -24,6 +25,7 @@ from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.colour.radiance import check_radiance
 from stage.errors import CalibrationError, ManifestError
 from stage.formats import images
+from stage.stack.correction import FULL_SCALE
 
 EVEN_LEVELS = 256
 """The count of levels of the response, which is that of an eight-bit projector."""
@@ -44,6 +46,7 @@ class ResponseResult(NamedTuple):
     """Exponent of the power of the level that is nearest to the response."""
     spread: float
     """Median deviation of a pixel from the response, as a part of full scale."""
+    warnings: tuple[str, ...]
 
 
 def response(request: ResponseRequest, progress: Progress | None = None) -> ResponseResult:
@@ -64,8 +67,8 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded)
         flat = recorded.reshape(-1, 3)[inside]
-        if manifest.saturation is not None:
-            usable &= (flat < manifest.saturation).all(axis=-1)
+        limit = manifest.saturation if manifest.saturation is not None else FULL_SCALE if images.read_header(path).integer else np.inf
+        usable &= (flat < limit).all(axis=-1)
         linear = linearise(recorded, manifest.color_space).reshape(-1, 3)[inside]
         readings[number] = linear @ np.array(GREY_WEIGHTS, np.float32)
         timings.advance(number + 1)
@@ -78,8 +81,8 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
     updated = manifest.model_copy(update={"projector": manifest.projector.model_copy(update={"response": values})})
     report = write_results("response", request, updated, manifest_path, {
         "images": len(request.images), "levels": digits(levels), "gamma": float(f"{found.gamma:.4g}"),
-        "spread": float(f"{found.spread:.3g}")})
-    return ResponseResult(manifest_path, report, found.gamma, found.spread)
+        "spread": float(f"{found.spread:.3g}"), "warnings": list(found.faults)})
+    return ResponseResult(manifest_path, report, found.gamma, found.spread, found.faults)
 
 
 class Response(NamedTuple):
@@ -90,6 +93,8 @@ class Response(NamedTuple):
     """The exponent of the nearest power law."""
     spread: float
     """The median absolute deviation of the pixels from the response, relative to full scale."""
+    faults: tuple[str, ...]
+    """What the images say against it."""
 
 
 def fit_response(
@@ -116,7 +121,8 @@ def fit_response(
         raise CalibrationError(f"only {count} pixels get brighter with the level and do not saturate: check the images and their order")
     kept = np.flatnonzero(good)[:: max(1, count // MOST_PIXELS)]
     ratio = (images[order][:, kept] - dark[kept]) / swing[kept]
-    curve = np.median(ratio, axis=1)
+    # of sums: a median of ratios under noise is drawn to one half
+    curve = (images[order][:, kept].astype(np.float64) - dark[kept]).sum(axis=1) / swing[kept].sum()
     if (np.diff(curve) < -0.02).any():
         worst = int(np.argmin(np.diff(curve)))
         raise CalibrationError(f"the light falls from level {x[worst]:g} to {x[worst + 1]:g}: check the order of the images")
@@ -129,4 +135,6 @@ def fit_response(
     values = np.maximum.accumulate(values + LEAST_STEP * np.arange(EVEN_LEVELS))
     values = (values + LEAST_STEP * np.arange(EVEN_LEVELS)) - values[0]
     spread = float(np.median(np.abs(ratio - curve[:, None])))
-    return Response(values / values[-1], gamma, spread)
+    seen = images[order] if usable is None else images[order][:, usable]
+    faults = response_faults(x, seen.astype(np.float64), curve, float(np.sqrt(np.mean(swing[kept] ** 2))), spread)
+    return Response(values / values[-1], gamma, spread, faults)

@@ -108,6 +108,7 @@ def _response(result: Any) -> None:
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
     print(f"response nearest to level^{result.gamma:.2f}; pixels deviate by {100 * result.spread:.2g} % of full scale")
+    print_warnings(result.warnings)
 
 
 def _tof(result: Any) -> None:

@@ -203,6 +203,39 @@ def test_saturated_pixels_take_no_part():
     assert np.abs(found.values - np.linspace(0, 1, 256)).max() < 1e-3
 
 
+def squared(images):
+    return 0.9 * np.clip(images, 0, None) ** 0.5
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda images: images, None),
+    (squared, "not linear in light"),
+    (lambda images: images * np.linspace(1, 0.6, 9)[:, None], "gets darker with the level"),
+    (lambda images: images * (1 + 0.1 * np.sin(17 * np.arange(9)))[:, None], "not linear in light, or exposure"),
+    (lambda images: images[[0, 1, 2, 3, 4, 4, 5, 7, 8]], "the light of level 0.75"),
+    (lambda images: images + RNG.normal(0, 0.05, images.shape), "give brighter images"),
+], ids=["right", "gamma of the camera", "automatic exposure", "flicker", "a level shown twice", "noise"])
+def test_images_that_contradict_the_response_are_said(change, words):
+    """Pixels that read between nothing and half of full scale of the projector, under light of the room."""
+    levels, scale = np.linspace(0, 1, 9), np.concatenate([np.zeros(200), np.linspace(0.1, 0.5, 2000)])
+    images = change(0.05 + scale * (levels**2.2)[:, None] + RNG.normal(0, 0.002, (9, 2200))).astype(np.float32)
+    found = fit_response(levels, images)
+    assert (found.faults == ()) if words is None else any(words in fault for fault in found.faults), found.faults
+
+
+def test_readings_at_full_scale_of_an_image_take_no_part(relit, tmp_path):
+    """Most pixels of 8-bit images clip at the brighter levels, and no saturation is declared."""
+    folder = write_capture(tmp_path / "cap", make_scene(COLS, 3))
+    levels, lit = np.linspace(0, 1, 9), np.linspace(0.2, 4, COLS)
+    edit_manifest(folder, mask=None, color_space="lin_rec709_scene", projector={"resolution": [64, 48]})
+    for number, level in enumerate(levels):
+        seen = np.clip(255 * (0.02 + lit * level**2.2), 0, 255).round().astype(np.uint8)
+        write_image(folder / f"grey{number}.png", np.broadcast_to(seen[None, :, None], (COLS, COLS, 3)))
+    relit.done("calibrate", "response", folder, *(folder / f"grey{number}.png" for number in range(9)))
+    response = Capture.open(folder).manifest.projector.response
+    assert np.abs(np.array(response) - np.linspace(0, 1, 256) ** 2.2).max() < 0.005  # half a step of the file is 0.004
+
+
 @pytest.mark.parametrize(("levels", "curve", "words"), [
     ([0, 1], lambda x: x, "three or more"),
     ([0, 0.5, 0.9], lambda x: x, "with 0 and 1"),

@@ -1,0 +1,61 @@
+"""What images of uniformly grey projections say against the response that was fitted to them.
+
+Each pixel reads ambient + s · g(level). Where the readings of groups of pixels are no such lines of the response, the readings are not
+linear in light, or the exposure was not the same in all images; pixels that the projector does not reach, and that get darker with the
+level, tell of the latter. A level whose light is not between what its neighbours suggest is an image of another level.
+"""
+
+import numpy as np
+
+GROUPS = 24
+"""Groups of pixels of equal brightness, whose means have little noise."""
+BENT, BENT_SIGMAS = 0.002, 4.0
+"""Root mean square misfit of the lines, as a part of full scale and in standard errors, above which they are bent."""
+FALLING = -0.01
+"""Change of a group from the darkest to the brightest level, as a part of full scale, below which it gets darker."""
+ALONE = 0.05
+"""Light by which a level differs from what the levels beside it suggest, as a part of full scale."""
+MOST_SPREAD = 0.05
+"""Median deviation of the pixels from the response above which it is not sure."""
+
+
+def response_faults(levels: np.ndarray, readings: np.ndarray, curve: np.ndarray, full_scale: float, spread: float) -> tuple[str, ...]:
+    """Return sentences about what is wrong with the images of a response.
+    `levels`: [levels] rising from 0 to 1. `readings`: [levels, pixels] linear. `curve`: [levels] the light, from 0 to 1. `full_scale`: by
+    how much the readings rise. `spread`: median deviation of a pixel from the curve, as a part of full scale."""
+    design = np.column_stack([np.ones(len(levels)), curve])
+    basis = np.linalg.qr(design).Q
+    order = np.argsort(readings[1:-1].mean(axis=0))
+    groups = [readings[:, group] for group in np.array_split(order, min(GROUPS, len(order)))]
+    means = np.stack([group.mean(axis=1) for group in groups], axis=1)
+    left = means - basis @ (basis.T @ means)
+    errors = np.stack([(group - basis @ (basis.T @ group)).std(axis=1) / np.sqrt(group.shape[1]) for group in groups], axis=1)
+    bent, noise = (float(np.sqrt(np.mean(part**2))) / full_scale for part in (left, errors))
+    faults = []
+    if np.linalg.lstsq(design, means)[0][1].min() < min(FALLING, -BENT_SIGMAS * noise) * full_scale:
+        faults.append("where the projector does not reach it gets darker with the level, as under an automatic exposure: fix exposure, "
+                      "gain and white balance")
+    elif bent > BENT and bent > BENT_SIGMAS * noise:
+        faults.append(f"readings miss ambient + s · response by {100 * bent:.2g} % of full scale: they are not linear in light, or "
+                      "exposure, ambient light or the camera changed: check color_space and saturation, and fix exposure, gain and white "
+                      "balance")
+    alone = _alone(levels, curve)
+    worst = int(np.abs(alone).argmax())
+    if abs(alone[worst]) > ALONE:
+        faults.append(f"the light of level {levels[worst]:.3g} is {abs(alone[worst]):.2g} of full scale off what the levels beside it "
+                      "suggest: check that its image shows this level")
+    if spread > MOST_SPREAD:
+        faults.append(f"pixels deviate by {spread:.2g} of full scale from the response: give brighter images, without anything that moves")
+    return tuple(faults)
+
+
+def _alone(levels: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Return by how much the light of each level differs from the power of it that the levels beside it suggest; 0 at the ends."""
+    off = np.zeros(len(levels))
+    inner = np.flatnonzero((curve > 0) & (curve < 1) & (levels > 0) & (levels < 1))
+    if len(inner) < 3:
+        return off
+    exponent = np.log(curve[inner]) / np.log(levels[inner])
+    padded = np.concatenate([[2 * exponent[0] - exponent[1]], exponent, [2 * exponent[-1] - exponent[-2]]])
+    off[inner] = curve[inner] - levels[inner] ** ((padded[:-2] + padded[2:]) / 2)
+    return off
