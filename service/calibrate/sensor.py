@@ -13,6 +13,7 @@ import numpy as np
 
 from service import __version__
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
+from service.calibrate.solvers.card_faults import card_faults, check_dark, mixed_colours
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest, WhiteBalanceRequest
@@ -43,6 +44,7 @@ class ImageCalibration(NamedTuple):
     image_path: Path
     noise: float
     """Standard deviation of one input image, linear; 0 when there is only one."""
+    warnings: tuple[str, ...]
 
 
 class Saturation(NamedTuple):
@@ -61,6 +63,7 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
     _refuse_overwrite(request.images, manifest_path.parent / DARK_FILE)
     timings.stage("images", len(request.images))
     mean = mean_image(request.images, capture, progress=timings.advance)
+    check_dark(mean.pixels, mean.noise, capture)
     timings.close()
     return _write(DARK_FILE, "dark", request, capture, manifest_path, mean.pixels.astype(np.float32), {
         "images": mean.images, "noise": float(f"{mean.noise:.4g}"), "mean": digits(mean.pixels.mean(axis=(0, 1)))})
@@ -77,10 +80,13 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
         white_dark = mean_image(request.dark_images, capture, progress=lambda done: timings.advance(white.images + done))
     flat = make_flat(white, white_dark, capture)
     timings.close()
-    seen = flat[capture.mask()]
+    mask = capture.mask()
+    dark = capture.manifest.dark
+    light = flat if dark is None else flat - linearise(capture.recorded(dark), capture.manifest.color_space)
+    seen = flat[mask]
     return _write(FLAT_FILE, "flat", request, capture, manifest_path, flat, {
         "images": white.images, "noise": float(f"{white.noise:.4g}"),
-        "least": digits(seen.min(axis=0)), "most": digits(seen.max(axis=0))})
+        "least": digits(seen.min(axis=0)), "most": digits(seen.max(axis=0)), "warnings": list(card_faults(light, mask))})
 
 
 def saturation(request: SaturationRequest, progress: Progress | None = None) -> Saturation:
@@ -175,7 +181,7 @@ def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, captu
         "relit:version": __version__, "relit:capture": capture.name, "relit:calibration": kind,
         "relit:inputs": " ".join(path.name for path in request.images)})
     report = write_results(kind, request, capture.manifest.model_copy(update={field: name}), manifest_path, section)
-    return ImageCalibration(manifest_path, report, image_path, section["noise"])
+    return ImageCalibration(manifest_path, report, image_path, section["noise"], tuple(section.get("warnings", ())))
 
 
 class MeanImage(NamedTuple):
@@ -250,6 +256,7 @@ class WhiteBalance(NamedTuple):
     """Factors of red, green and blue after which the card is grey; that of green is 1."""
     matrix: tuple[tuple[float, float, float], ...]
     """The new `color_matrix` of the manifest, by rows."""
+    warnings: tuple[str, ...]
 
 
 def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None) -> WhiteBalance:
@@ -290,7 +297,10 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         space = linear_space(capture.manifest.color_space)
         matrix = rgb_matrix("lin_rec709_scene", space).astype(np.float64) @ rec709_from_camera(request.images[0]) @ matrix
     rows = color_matrix(matrix)
+    mixed = mixed_colours(card)
+    warnings = () if mixed is None else (f"--region: colours in it differ by {100 * mixed:.0f} %: choose a part that the card alone fills, "
+                                         "in one light",)
     report = write_results("white-balance", request, capture.manifest.with_colors(rows), manifest_path, {
         "images": len(request.images), "region": list(region), "gains": digits(gains), "matrix": rows,
-        "unevenness": digits(card.std(axis=(0, 1)) / mean)})
-    return WhiteBalance(manifest_path, report, (float(gains[0]), 1.0, float(gains[2])), rows)
+        "unevenness": digits(card.std(axis=(0, 1)) / mean), "warnings": list(warnings)})
+    return WhiteBalance(manifest_path, report, (float(gains[0]), 1.0, float(gains[2])), rows, warnings)

@@ -72,6 +72,7 @@ def _white_balance(result: Any) -> None:
     print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
     for row in result.matrix:
         print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
+    print_warnings(result.warnings)
 
 
 def _chart(result: Any) -> None:
@@ -153,3 +154,4 @@ def _print_lights(result: "LightCalibration") -> None:
 def _print_image(name: str, result: "ImageCalibration") -> None:
     print(f"{name:<8} {result.image_path}")
     _print_files((result.manifest_path,), result.report_path)
+    print_warnings(result.warnings)

@@ -7,6 +7,7 @@ import pytest
 
 from service.calibrate.response import fit_response
 from service.calibrate.sensor import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
+from service.calibrate.solvers.card_faults import card_faults
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr
@@ -87,6 +88,41 @@ def test_cards_that_are_refused(folder):
     grey = mean_image(images(folder, "g", [np.full((SIZE, SIZE, 3), 0.1)]), capture)
     with pytest.raises(CalibrationError, match="not brighter than the dark frame at"):
         make_flat(grey, mean_image(images(folder, "d", [np.full((SIZE, SIZE, 3), 0.2)]), capture), capture)
+
+
+def test_a_dark_image_with_light_in_it_is_refused(relit, tmp_path):
+    folder = write_capture(tmp_path / "cap", make_scene(32, 3))
+    before = (folder / "capture.json").read_bytes()
+    lit = write_exr(tmp_path / "lit.exr", Capture.open(folder).recorded(Capture.open(folder).manifest.frames[0].image))
+    assert "are darker than the dark image" in relit.refused("calibrate", "dark", folder, lit)
+    assert (folder / "capture.json").read_bytes() == before
+    covered = [write_exr(tmp_path / f"{number}.exr", np.abs(RNG.normal(0, 1e-4, (32, 32, 3)))) for number in range(3)]
+    relit.done("calibrate", "dark", folder, *covered)
+
+
+V, U = np.mgrid[-0.74:0.74:60j, -0.99:0.99:80j]
+LENS = 1 - 0.25 * (V**2 + U**2)
+
+
+@pytest.mark.parametrize(("light", "words"), [
+    (LENS, None),
+    (1 - 0.25 * (V**2 + (U - 0.1) ** 2), None),  # of a lens that stands aside of the sensor
+    (LENS * (1 + 0.2 * U), "falls by 3"),
+    (LENS * np.where(U > 0.3, 0.6, 1), "uneven by"),
+    (LENS * (1 + 0.1 * np.sin(12 * U) * np.sin(9 * V)), "uneven by"),
+], ids=["a lens", "aside", "a lamp from the side", "a shadow", "an object"])
+def test_a_card_that_is_not_evenly_lit_is_said(light, words):
+    card = light[..., None] * (0.8, 0.7, 0.6) * (1 + RNG.normal(0, 0.02, (60, 80, 3)))
+    faults = card_faults(card, V**2 + U**2 < 1.2)
+    assert (faults == ()) if words is None else any(words in fault for fault in faults), faults
+
+
+def test_a_region_with_more_than_the_card_is_said(relit, tmp_path):
+    folder = write_capture(tmp_path / "cap", make_scene(32, 3))
+    card = np.linspace(0.3, 0.6, 32)[:, None, None] * np.array((1.0, 0.8, 0.5)) * np.ones((32, 32, 1))
+    assert "colours in it differ" not in relit.done("calibrate", "white-balance", folder, write_exr(tmp_path / "card.exr", card)).out
+    card[:, 24:] *= (0.6, 1.0, 1.4)
+    assert "colours in it differ" in relit.done("calibrate", "white-balance", folder, write_exr(tmp_path / "half.exr", card)).out
 
 
 def pile(values, peak=None):

@@ -1,0 +1,77 @@
+"""What images of a covered lens and of cards show that they should not: light in the dark, light that falls across a card, and other things
+than the card."""
+
+import numpy as np
+
+from kernels.photometric.model.samples import evenly
+from stage.capture.capture import Capture
+from stage.colour.colour import GREY_WEIGHTS, linearise
+from stage.errors import CalibrationError
+
+FRAMES = 8
+"""Frames that a dark image is compared with."""
+BELOW, BELOW_SIGMAS = 0.01, 5.0
+"""By how much a reading is darker than the dark image: as a part of the brighter readings, and in standard deviations of an image."""
+MOST_BELOW = 0.02
+"""Part of the readings that may be darker."""
+CELLS = 48
+"""Squares across an image whose means are looked at: their noise is little."""
+FALL = 0.15
+"""Part by which the light on a card may fall from one side of the image to the other; lenses darken all sides alike."""
+ROUGH = 0.03
+"""Root mean square deviation of a card from an even fall and a lens."""
+MIXED = 0.05
+"""Standard deviation of the colours within the region of a card, as a part of them."""
+
+
+def check_dark(dark: np.ndarray, noise: float, capture: Capture) -> None:
+    """Refuse a dark image, [rows, cols, 3] linear, that frames of the capture are darker than: it has light, or another exposure.
+    `noise`: standard deviation of one image. Raises CalibrationError; it names the frame."""
+    mask = capture.mask()
+    names = [frame.image for frame in capture.manifest.frames if not frame.image.endswith(".npy")]
+    for number in evenly(len(names), FRAMES):
+        read = linearise(capture.recorded(names[number]), capture.manifest.color_space)[mask]
+        least = max(BELOW * float(np.percentile(read, 95)), BELOW_SIGMAS * noise)
+        below = float((read < dark[mask] - least).mean())
+        if below > MOST_BELOW:
+            raise CalibrationError(f"{capture.file(names[number])}: {100 * below:.0f} % of its readings are darker than the dark image: "
+                                   "cover the lens, and take it at the exposure of the frames")
+
+
+def card_faults(card: np.ndarray, mask: np.ndarray) -> tuple[str, ...]:
+    """Return sentences about a card that should be white everywhere in the mask [rows, cols]: its light falls from one side to the other,
+    or something else is seen. `card`: [rows, cols, 3] linear."""
+    height, width = mask.shape
+    grey = np.where(mask, card @ np.array(GREY_WEIGHTS), 0.0)
+    side = max(height, width) / CELLS
+    v, u = np.nonzero(mask & (grey > 0))
+    cell = (v // side).astype(int) * CELLS + (u // side).astype(int)
+    count = np.bincount(cell, minlength=CELLS * CELLS)
+    known = np.flatnonzero(count)
+    light, x, y = (np.bincount(cell, values, CELLS * CELLS)[known] / count[known]
+                   for values in (grey[v, u], 2 * (u + 0.5) / width - 1, 2 * (v + 0.5) / height - 1))
+    across = (x**2 * width**2 + y**2 * height**2) / (width**2 + height**2)
+    design = np.column_stack([np.ones(len(known)), x, y, across, across**2])
+    weight = np.sqrt(count[known])[:, None]
+    values = np.linalg.lstsq(design * weight, np.log(light)[:, None] * weight)[0][:, 0]
+    fall = 1 - float(np.exp(-np.ptp(design[:, 1:3] @ values[1:3])))
+    rough = float(np.sqrt(np.average((np.log(light) - design @ values) ** 2, weights=count[known])))
+    faults = []
+    if fall > FALL:
+        faults.append(f"the light on the card falls by {100 * fall:.0f} % from one side of the image to the other, which no lens makes: "
+                      "light it evenly, or once from either side, and give both images")
+    if rough > ROUGH:
+        faults.append(f"the card is uneven by {100 * rough:.1f} % (RMS) beside what a lens makes: let a plain card fill the images, "
+                      "without shadows, and out of focus")
+    return tuple(faults)
+
+
+def mixed_colours(region: np.ndarray) -> float | None:
+    """Return by how much the colours within a region [rows, cols, 3] differ, as a part of them; None if they are those of one card."""
+    rows, cols = (max(extent // CELLS, 1) for extent in region.shape[:2])
+    cut = region[:region.shape[0] // rows * rows, :region.shape[1] // cols * cols]
+    cells = cut.reshape(cut.shape[0] // rows, rows, cut.shape[1] // cols, cols, 3).mean(axis=(1, 3)).reshape(-1, 3)
+    lit = cells[(cells > 0).all(axis=1)]
+    colours = lit / lit.sum(axis=1, keepdims=True) if len(lit) else np.ones((1, 3))
+    spread = float((colours.std(axis=0) / colours.mean(axis=0)).max())
+    return spread if spread > MIXED else None
