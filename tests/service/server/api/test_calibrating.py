@@ -116,9 +116,10 @@ def test_the_colours_of_a_chart(server, client, tmp_path):
 def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate((1.0, 8.0))]
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
-    calibrate_tof(requests.TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
-    job = finish(server, client, submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent)))
-    compare(client, job, tmp_path, {"tof.json": "camera.json"}, {})
+    calibrate_tof(requests.TofCalibrationRequest(sweep=path, out=tmp_path / "tof.json", device="cpu"))
+    uploaded = sent(server, client, path.parent)
+    job = finish(server, client, submit(client, kind="calibrate-tof", capture=uploaded))
+    compare(client, job, tmp_path, {name: name for name in ("tof.json", "calibration.json")}, {path.parent: uploaded})
 
 
 @pytest.mark.long
