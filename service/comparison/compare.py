@@ -21,6 +21,7 @@ from service.comparison.deviations import (
     table,
 )
 from service.comparison.placing import Placement, place
+from service.comparison.size import Size, size_of
 from service.comparison.surfaces import Design, Offsets, ScannedSurface, read_design, read_scanned
 from service.errors import RequestError
 from service.relight.sheet import write_sheet
@@ -110,7 +111,8 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     strange = standing_on(design, found, patches, patch_m=patch)
     verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
                          least_seen=request.least_seen, one_pose=not placement.rivals)
-    warnings = _warnings(scan, placement, found)
+    size = size_of(patches, placement.pivot)
+    warnings = _warnings(scan, placement, found, size)
     timings.stage("write", 1)
     span = span_of(found)
     colours = colours_of(found, span)
@@ -122,7 +124,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
         write_text(regions_path, table(verdicts))
     write_text(report_path, report(
         request, inputs={"scan": _input(request.scan), "design": _input(request.design)}, device=devices.describe(device),
-        timings_s=timings.close(), placement=_placement_facts(placement), deviations=_facts(found, sigma, len(scan.points), span),
+        timings_s=timings.close(), placement=_placement_facts(placement, size), deviations=_facts(found, sigma, len(scan.points), span),
         sigma_source=scan.sigma_source, reach_m=reach, smallest_fault_m=2 * patch, patches=len(patches.deviation),
         decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts], warnings=warnings))
     return CompareResult(deviations_path, picture_path, report_path, regions_path, float(np.median(found.distance)),
@@ -168,8 +170,11 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(cKDTree(points).query(chosen, k=NEIGHBOUR + 1)[0][:, NEIGHBOUR]))
 
 
-def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations) -> list[str]:
+def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations, size: Size | None) -> list[str]:
     warnings = []
+    if size is not None:
+        warnings.append(f"the scan is {size.factor:.5f} times as large as the design (± {size.sigma:.1g}), as where the calibration of the "
+                        "scanner, a unit or a temperature is off: deviations hold that too")
     if placement.rivals:
         warnings.append(f"{placement.rivals} other poses fit about as well, as of a part that looks the same when it is turned: regions "
                         "may be those of another side, and none is decided; place the scan roughly, and give --align refine")
@@ -189,9 +194,10 @@ def _input(path: Path) -> dict[str, Any]:
     return {"path": str(path)} if path.is_dir() else {"path": str(path), "content": fingerprint.digest(path)}
 
 
-def _placement_facts(placement: Placement) -> dict[str, Any]:
+def _placement_facts(placement: Placement, size: Size | None) -> dict[str, Any]:
     return {"design_from_scan": placement.pose.tolist(), "pivot_m": placement.pivot.tolist(), "covariance": placement.covariance.tolist(),
-            "sigma_m": placement.sigma_m, "other_poses": placement.rivals, "open_motions": placement.held}
+            "sigma_m": placement.sigma_m, "other_poses": placement.rivals, "open_motions": placement.held,
+            **({} if size is None else {"size_factor": size.factor, "size_factor_sigma": size.sigma})}
 
 
 def _facts(found: Deviations, sigma: np.ndarray, points: int, span: float) -> dict[str, Any]:

@@ -115,6 +115,21 @@ def test_a_datum_carries_the_scan(tmp_path, part):
     assert reported(result)["placement"]["open_motions"] == 3  # a plane leaves two shifts and a turn open
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.003])
+def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
+    """A dent of .15 mm does not make the scan smaller, and does not hide that it is larger: the factor is known to .0001."""
+    made, design = part
+    seen = scan_of(made, np.random.default_rng(4), 20_000, None, below, dent)
+    scan = write_scan(tmp_path / "scan.ply", seen._replace(points=factor * seen.points))
+    result = compare(request(tmp_path, scan, design, align="refine"))
+    placement = reported(result)["placement"]
+    if factor == 1:
+        assert "size_factor" not in placement and not any("times as large" in words for words in result.warnings)
+    else:
+        assert placement["size_factor"] == pytest.approx(factor, abs=1e-4)
+        assert any("1.0030" in words and "times as large" in words for words in result.warnings)
+
+
 @pytest.mark.long
 def test_what_the_surface_leaves_open_is_said(tmp_path):
     random = np.random.default_rng(1)
