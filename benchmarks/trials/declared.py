@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.trials.lights import trial, write_grey
@@ -53,6 +54,8 @@ class Case:
     turned: float = 0.0
     """Angle in degrees by which all far lamps are declared turned about the axis to the right."""
     refined: bool = False
+    adapted: bool = False
+    """Whether the images have eight bits and were dimmed where they are bright, as HDR modes of phones do it."""
 
 
 HALF_M = 0.1
@@ -73,6 +76,8 @@ CASES = [
     Case("egg, 8 lights, declared turned by 5°, refined", "egg", "matt", 8, turned=5.0, refined=True),
     Case("field, gloss, 24 lights, declared turned by 10°", "field", "gloss", 24, turned=10.0),
     Case("egg, gloss, 40 lights, declared turned by 5°, refined", "egg", "gloss", 40, turned=5.0, refined=True),
+    Case("field, 10 lights, images adapted from place to place", "field", "matt", 10, adapted=True),
+    Case("egg, 8 lights, images adapted from place to place", "egg", "matt", 8, adapted=True),
 ]
 
 
@@ -126,7 +131,10 @@ def write(folder: Path, case: Case, number: int) -> Surface:
     images *= scale
     images += NOISE * np.sqrt(images + 0.01) * random.standard_normal(images.shape)
     frames = []
-    for place, (image, direction) in enumerate(zip(np.clip(images, 0, 1) * found.mask, directions, strict=True)):
+    images = np.clip(images, 0, 1) * found.mask
+    if case.adapted:
+        images = np.stack([dimmed_where_bright(image) for image in images])
+    for place, (image, direction) in enumerate(zip(images, directions, strict=True)):
         write_grey(folder / f"{place:02d}.exr", image)
         told = Rotation.from_rotvec([case.turned, 0, 0], degrees=True).apply(direction)
         light = {"type": "distant", "direction": told.tolist(), "irradiance": [np.pi] * 3}
@@ -138,9 +146,16 @@ def write(folder: Path, case: Case, number: int) -> Surface:
     write_grey(folder / "mask.exr", found.mask)
     (folder / "capture.json").write_text(json.dumps({
         "schema": "relit.capture/1", "name": "declared", "frames": frames, "mask": "mask.exr", "saturation": 0.999,
-        "irradiance_scale": "relative", "camera": {"projection": "orthographic", "resolution": [SIZE, SIZE],
-                                                   **({"pixel_size_m": 2 * HALF_M / SIZE, "surface_z_m": 0.0} if case.near else {})}}))
+        "irradiance_scale": "relative", "color_space": "srgb_texture" if case.adapted else "lin_rec709_scene",
+        "camera": {"projection": "orthographic", "resolution": [SIZE, SIZE],
+                   **({"pixel_size_m": 2 * HALF_M / SIZE, "surface_z_m": 0.0} if case.near else {})}}))
     return found
+
+
+def dimmed_where_bright(light: np.ndarray) -> np.ndarray:
+    """Return [rows, cols] light from 0 to 1 as codes of eight bits from 0 to 1, dimmed by the mean code around each pixel."""
+    codes = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.clip(0.7 * codes / (0.3 + 1.4 * gaussian_filter(codes, SIZE / 8)), 0, 1)) / 255
 
 
 def trials(data: Path | None) -> Iterator[Trial]:
@@ -150,6 +165,6 @@ def trials(data: Path | None) -> Iterator[Trial]:
             truth = write(Path(folder), case, number)
             method = Method.SVBRDF if case.lights >= 12 else Method.ROBUST
             placed = case.away is None or (case.near and not any(case.aside_m) and case.factor == 1)
-            right = placed and not case.doubled and not case.turned and case.material != "velvet"
+            right = placed and not case.doubled and not case.turned and not case.adapted and case.material != "velvet"
             yield trial(case.name, Path(folder), truth.normal, truth.mask, in_model=right, method=method,
                         lights=LightsKnown.REFINED if case.refined else LightsKnown.DECLARED)[0]

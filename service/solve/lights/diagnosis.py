@@ -23,6 +23,7 @@ from service.light_estimation.explanations import (
 from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
+from service.solve.lights.adapted import find_adapted
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.placement import find_placement
 from service.solve.lights.turn import find_turn
@@ -30,6 +31,7 @@ from stage.capture.capture import Capture
 from stage.capture.gradients import GradientFrames
 from stage.capture.lighting import ExtendedLights
 from stage.capture.point_lights import DistantLights, PlacedLights
+from stage.colour.colour_spaces import is_linear
 
 TRIED_PIXELS = 600
 """Pixels, spread over the object, that are compared."""
@@ -107,6 +109,8 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
                 raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
+        if estimated and not is_linear(capture.manifest.color_space):
+            _hold_adapted(given, sample, solution)
         other = find_other_lights(given, lights) if found is None or found.cause is Cause.IRRADIANCE else None
         if other is not None:
             solution.warnings.append(other.sentence)
@@ -138,6 +142,20 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
                 "(--lights refined); sigma holds the error that this makes")
             solution.facts["light_turn"] = turn.facts()
             raise_error(solution, turn.error(solution.normal))
+
+
+def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None:
+    """Make normals less sure by what they would be if the images were adapted in brightness from place to place."""
+    inside = np.flatnonzero(given.mask)
+    chosen = inside[evenly(len(inside), PIXELS)]
+    adapted = find_adapted(sample, np.stack(np.divmod(chosen, given.mask.shape[1]), axis=1))
+    if adapted is None:
+        return
+    turned = np.degrees(np.arccos(np.clip((solution.normal[:, chosen] * adapted.fit.normal).sum(axis=0), -1, 1)))
+    solution.warnings.append("images: they may be adapted in brightness from place to place, as by HDR or local contrast of a phone, in "
+                             f"place of lights of other strengths, which turns normals by {np.median(turned):.2g}°: give images without; "
+                             "sigma holds that")
+    raise_error(solution, at_all_pixels(given.mask, chosen, turned))
 
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
