@@ -3,36 +3,31 @@
 The surface is cut where depth shows steps that the normals do not explain, the normals are integrated between the cuts, each part is
 placed by its depths, and what is left of the difference corrects heights and normals scale by scale, as far as it is error of the
 normals and not noise of the depth.
-
-The difference of the two maps is averaged over cells of 2^l pixels, from the largest scale to the smallest. What cells differ by beyond
-the noise of the noisy map, which is known, is the error of the other at that scale; each cell is corrected by the part of its
-difference that is error and not noise, S / (S + N), and the next smaller scale sees what is left.
-
-Source: Nehab, Rusinkiewicz, Davis and Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry", SIGGRAPH 2005,
-which filters with one fixed scale in place of the noise and error of each; the shrinkage is that of Wiener (1949), with the variance of
-the error estimated from the data at each scale (empirical Bayes, Efron and Morris, "Stein's estimation rule and its competitors", 1973).
 """
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from kernels.surface.slopes import STEEPEST
+from service.joining.correction import correct
 from service.joining.depth_steps import SLOPE_ERROR, Edges, find_steps
+from service.joining.relief import Relief, compare_relief
 from stage.spread import MAD_TO_SIGMA
 
 LEAST_DEPTHS = 12
 """Number of depths by which a part is placed; one with fewer has no place of its own."""
-PASSES = 2
-"""Number of times each scale is looked at: cells are interpolated, which leaves part of a correction undone."""
-REJECTED = 5.0
-"""Difference from its surroundings, in robust standard deviations, beyond which a reading is left out."""
-SURROUNDINGS = 3
-"""Scale of these surroundings, cells of 2^3 pixels."""
+
+
+
+
+MOST_NOISE = 1000.0
+"""The largest factor of the noise that is looked for."""
 
 
 class Joined(NamedTuple):
@@ -47,6 +42,11 @@ class Joined(NamedTuple):
     guessed: np.ndarray  # [rows, cols] bool, beside a step without a depth of its own: which side it belongs to is a guess
     unexplained: float | None
     """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
+    noise_factor: float
+    """By which the noise of the depths exceeds their standard deviations."""
+    relief: Relief
+    shared_m: float
+    """Standard deviation of errors that neighbouring depths share."""
 
 
 def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
@@ -70,8 +70,12 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     both = solved & measured
     u, u_sigma = plane.to_heights(-depth.astype(np.float64), both), plane.to_sigmas(depth, depth_sigma, both)
     slopes = plane.slopes(np.where(solved, normal, 0).astype(np.float64))
+    own_error = plane.slope_error(slopes, normal_sigma)
     error = plane.slope_error(slopes, normal_sigma + SLOPE_ERROR)
-    cuts = find_steps(u, u_sigma, both, *(_edges(plane, normal, slopes, error, solved, axis) for axis in (1, 0)))
+    right, down = (_edges(plane, normal, slopes, error, solved, axis) for axis in (1, 0))
+    noise_factor = noise_over_sigma(u, u_sigma, both, right, down)
+    u_sigma = u_sigma * noise_factor
+    cuts = find_steps(u, u_sigma, both, right, down)
     mean_z = -float(np.median(depth[measured]))
     found = integrate_normals(normal.astype(np.float32), solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective,
                               mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
@@ -82,20 +86,27 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     part = np.where(solved, part, -1)
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
-    known, relief, left = both & cuts.depth, 0.0, 0.0
+    known, unlike, left, shared = both & cuts.depth, 0.0, 0.0, 0.0
+    largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
+    relief = compare_relief(u, u_sigma, base, known & (part == largest), part)
+    base = base * relief.factor
     for box, here in _parts(part):
         seen = here & known[box]
         if seen.sum() < LEAST_DEPTHS:
             continue
-        fixed = correct(u[box] - base[box], u_sigma[box], seen, here)
+        fixed = correct(u[box] - base[box], u_sigma[box], seen, here, slope_error=float(np.median(own_error[box][here])))
         for target, values in ((correction, fixed.value), (variance, fixed.variance)):
             target[box][here] = values[here]
+        shared = max(shared, fixed.shared)
         placed[box][here] = True
         rejected[box][fixed.rejected] = True
         used = seen & ~fixed.rejected
-        relief += _variation(u[box][used], u_sigma[box][used])
+        unlike += _variation(u[box][used], u_sigma[box][used])
         left += _variation((u - base)[box][used], u_sigma[box][used])
-    corrected = plane.turned(normal.astype(np.float64), slopes, correction, part, solved)
+    # turned lights look like a shift where surfaces are round, but the correction takes them up, and not a shift
+    shift_px = compare_relief(u - correction, u_sigma, base, known & (part == largest) & ~rejected, part).shift_px
+    variance += _shifted(base, shift_px)
+    corrected = plane.turned(normal.astype(np.float64), slopes, correction + (1 - 1 / relief.factor) * base, part, solved)
     z = np.where(placed, plane.to_z(base + correction), 0)
     sigma = np.where(placed, plane.to_depth_sigmas(z, np.sqrt(variance)), 0)
     unplaced = solved & ~placed
@@ -103,7 +114,15 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         known_z = z[placed].mean() if placed.any() else mean_z
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
-                  None if relief == 0 else left / relief)
+                  None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
+                  float(plane.to_depth_sigmas(np.array(mean_z), np.array(shared))))
+
+
+def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
+    """Return the squares of by how much heights differ from those that are shifted."""
+    if not any(shift_px):
+        return np.zeros(base.shape)
+    return np.asarray(sum(np.gradient(base, axis=axis) * part for axis, part in zip((1, 0), shift_px, strict=True)) ** 2)
 
 
 def _variation(values: np.ndarray, sigma: np.ndarray) -> float:
@@ -113,6 +132,26 @@ def _variation(values: np.ndarray, sigma: np.ndarray) -> float:
     found = float((weight * (values - np.average(values, weights=weight)) ** 2).sum())
     expected = len(values) - 1
     return found - expected if found > expected + 3 * np.sqrt(2 * expected) else 0.0
+
+
+def noise_over_sigma(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, right: Edges, down: Edges) -> float:
+    """Return by which factor the noise of heights exceeds their standard deviations, 1 or more: of what neighbours differ by beyond the
+    slopes of the normals and the error of these.
+
+    The arguments are those of `find_steps`.
+    """
+    squares, noise, slope = [], [], []
+    for edges, axis in ((right, 1), (down, 0)):
+        held = _head(known & edges.joined, axis) & _tail(known, axis)
+        squares.append((np.diff(value, axis=axis) - _head(edges.slope, axis))[held] ** 2)
+        noise.append((_head(sigma, axis) ** 2 + _tail(sigma, axis) ** 2)[held])
+        slope.append(_head(edges.sigma, axis)[held] ** 2)
+    found, own, other = (np.concatenate(each) for each in (squares, noise, slope))
+
+    def beyond(factor: float) -> float:
+        return MAD_TO_SIGMA * float(np.sqrt(np.median(found / (factor**2 * own + other)))) - 1
+
+    return 1.0 if not len(found) or beyond(1.0) <= 0 else float(brentq(beyond, 1.0, MOST_NOISE)) if beyond(MOST_NOISE) < 0 else MOST_NOISE
 
 
 class _Plane:
@@ -228,79 +267,3 @@ def _check(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, dep
         raise ArrayError("a depth before a perspective camera must be above 0")
     if not (depth_sigma[measured] > 0).all():
         raise ArrayError("the standard deviation of a depth must be above 0")
-
-
-class Correction(NamedTuple):
-    """The correction of the smooth map."""
-
-    value: np.ndarray  # [rows, cols]
-    variance: np.ndarray  # [rows, cols] of the error that is left
-    rejected: np.ndarray  # [rows, cols] bool, readings that disagree with their surroundings
-
-
-def correct(
-    difference: np.ndarray,  # [rows, cols] noisy minus smooth
-    sigma: np.ndarray,  # [rows, cols] standard deviation of the noise, independent between pixels
-    known: np.ndarray,  # [rows, cols] bool, where there is a difference; one pixel or more
-    inside: np.ndarray,  # [rows, cols] bool, where the correction is wanted
-) -> Correction:
-    """Estimate the error of a smooth map from its difference to a noisy one."""
-    rejected = _outliers(difference, sigma, known)
-    weight = np.where(known & ~rejected, 1 / sigma**2, 0)
-    value = np.full(difference.shape, (weight * np.where(known, difference, 0)).sum() / weight.sum())
-    variance = np.full(difference.shape, 1 / weight.sum())
-    cover = inside.astype(np.float64)
-    levels = max(1, int(np.ceil(np.log2(max(difference.shape)))))
-    for level in range(levels - 1, -1, -1):
-        for again in range(PASSES):
-            weights = _sum_cells(weight, level)
-            left = _sum_cells(weight * np.where(known, difference - value, 0), level) / np.where(weights > 0, weights, 1)
-            whole = weights.sum()
-            cells = (weights > 0).sum()
-            noise = cells / whole  # mean of 1 / weights, weighted like the differences
-            error = max((weights * left**2).sum() / whole - noise, 0.0)
-            if again == 0:  # as much error as the noise may hide
-                hidden = error + noise * np.sqrt(2 / cells)
-                variance += _spread(hidden / (1 + hidden * weights), cover, level)
-            if error == 0:
-                break
-            value += _spread(error * weights / (error * weights + 1) * left, cover, level)
-    return Correction(value, variance, rejected)
-
-
-def _outliers(difference: np.ndarray, sigma: np.ndarray, known: np.ndarray) -> np.ndarray:
-    weight = np.where(known, 1 / sigma**2, 0)
-    weights = _sum_cells(weight, SURROUNDINGS)
-    mean = _sum_cells(weight * np.where(known, difference, 0), SURROUNDINGS) / np.where(weights > 0, weights, 1)
-    off = (difference - _interpolated(mean, weights, difference.shape, SURROUNDINGS)) / sigma
-    spread = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(off[known]))))
-    return known & (np.abs(off) > REJECTED * spread)
-
-
-def _sum_cells(plane: np.ndarray, level: int) -> np.ndarray:
-    """Return the sums over cells of 2^level pixels."""
-    side = 1 << level
-    rows, cols = (-(-count // side) for count in plane.shape)
-    framed = np.pad(plane, ((0, rows * side - plane.shape[0]), (0, cols * side - plane.shape[1])))
-    return framed.reshape(rows, side, cols, side).sum(axis=(1, 3))
-
-
-def _spread(cells: np.ndarray, cover: np.ndarray, level: int) -> np.ndarray:
-    """Return the pixels between the middles of cells; cells without a pixel inside do not count."""
-    return _interpolated(cells, (_sum_cells(cover, level) > 0).astype(np.float64), cover.shape, level)
-
-
-def _interpolated(cells: np.ndarray, weight: np.ndarray, shape: tuple[int, int], level: int) -> np.ndarray:
-    """Return bilinear interpolation of cells by their weights; 0 where all are 0."""
-    held = (weight > 0).astype(np.float64)
-    total, norm = (_bilinear(plane, shape, level) for plane in (cells * held, held))
-    return total / np.where(norm > 0, norm, 1)
-
-
-def _bilinear(cells: np.ndarray, shape: tuple[int, int], level: int) -> np.ndarray:
-    for axis, count in enumerate(shape):
-        place = np.clip((np.arange(count) + 0.5) / (1 << level) - 0.5, 0, cells.shape[axis] - 1)
-        low = np.minimum(place.astype(np.int64), max(cells.shape[axis] - 2, 0))
-        part = (place - low).reshape((-1, 1) if axis == 0 else (1, -1))
-        cells = np.take(cells, low, axis) * (1 - part) + np.take(cells, np.minimum(low + 1, cells.shape[axis] - 1), axis) * part
-    return cells

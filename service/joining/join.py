@@ -28,6 +28,8 @@ CAMERA_TOLERANCE = 1e-3
 CONTRADICTION = 0.5
 """Part of the relief of the depth that normals may leave unexplained before the two are refused as not of one surface: it is below .01
 where they are, and above 1 where the normals point another way."""
+NOISIER, SHARED = 1.5, 0.5
+"""Noise of the depth over its standard deviation, and errors that neighbours share over that, from which they are said."""
 MANY = 0.1
 """Part of the surface without a place of its own before it is said."""
 
@@ -123,6 +125,8 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "sigma_m": {"depth_median": _median(before), "joined_median": _median(joined.sigma[placed])},
         "normals_turned_degrees": {"median": _median(turned), "p95": round(float(np.percentile(turned, 95)), 4) if turned.size else 0.0},
         "parts": int(joined.part.max()) + 1,
+        "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
+        "normals_factor": round(joined.relief.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.relief.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
     }
 
@@ -133,6 +137,18 @@ def _median(values: np.ndarray) -> float:
 
 def _warnings(facts: dict[str, Any]) -> list[str]:
     pixels, found = facts["pixels"], []
+    if facts["depth_noise_factor"] > NOISIER:
+        found.append(f"depth: its noise is {facts['depth_noise_factor']:.2g} times sigma.Z, and counts as such")
+    if facts["depth_shared_error_m"] > SHARED * facts["sigma_m"]["depth_median"]:
+        found.append(f"depth: neighbours share errors of {facts['depth_shared_error_m']:.2g} m that no drift of normals makes, as after "
+                     "smoothing, by ripple or from another place of the camera: height_sigma holds them")
+    if facts["normals_factor"] != 1:
+        found.append(f"normals: the relief of the depth is {facts['normals_factor']:.3g} times theirs, which are "
+                     f"{'flat' if facts['normals_factor'] > 1 else 'steep'}: the joined ones have that of the depth")
+    if any(facts["depth_shift_px"]):
+        right, down = facts["depth_shift_px"]
+        found.append(f"depth: it looks shifted by {right:+.2g} px to the right and {down:+.2g} px down against the normals, as where the "
+                     "camera moved between both: take both from one place; height_sigma holds that")
     lost = (pixels["mask"] - pixels["placed"]) / pixels["mask"]
     if lost > MANY:
         found.append(f"height: {lost:.0%} of the surface has too few depths to be placed, and is kept as unsure")

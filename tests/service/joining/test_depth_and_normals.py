@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
+from benchmarks.trials.declared import surface
 from kernels.errors import ArrayError
 from kernels.status import Status
 from service.joining.depth_and_normals import Joined, join_depth
@@ -57,6 +60,59 @@ def test_a_tilted_disc_before_a_plane_keeps_both_and_their_distance(device, pers
     assert len(np.unique(joined.part)) == 2
     assert len(np.unique(joined.part[before])) == 1 and len(np.unique(joined.part[~before])) == 1
     assert np.abs(joined.height - view.z).max() < 0.5 * MM  # the noise of one depth, at the worst of all pixels
+
+
+WAVE = see("wave")
+
+
+def ripple(depth):
+    return depth + MM * np.sin(np.arange(depth.shape[1]) / 9)
+
+
+@pytest.mark.parametrize(("depth", "normals", "most"), [
+    (lambda depth: depth + 4 * SIGMA * np.random.default_rng(7).standard_normal(depth.shape), 1.0, 0.2 * MM),
+    (ripple, 2.0, 0.5 * MM),
+    (lambda depth: np.round(depth / (2 * MM)) * 2 * MM, 2.0, 0.2 * MM),
+    (lambda depth: gaussian_filter(depth, 4), 1.5, 0.2 * MM),
+    (lambda depth: np.roll(depth, 3, axis=1), 3.0, 0.8 * MM),
+], ids=["σ a quarter of the noise", "ripple", "steps of 2 mm", "smoothed", "shifted by 3 px"])
+def test_a_depth_that_is_worse_than_its_sigma_says_neither_bends_normals_nor_is_believed(device, depth, normals, most):
+    """Normals of 1° were turned by 4 to 48°, and heights were 3 to 8 σ off."""
+    noise = SIGMA * np.random.default_rng(2).standard_normal(WAVE.z.shape)
+    joined, _ = join(WAVE, noise=0.5, drift=1, sigma=SIGMA, device=device, depth=depth(-WAVE.z) + noise)
+    sure = ~joined.guessed & ~joined.rejected & joined.placed
+    error = np.abs(joined.height - WAVE.z)[sure]
+    assert sure.mean() > 0.95 and degrees_between(joined.normal, WAVE.normal)[sure].mean() < normals
+    assert np.sqrt((error**2).mean()) < most
+    assert np.median(error / joined.sigma[sure]) < 1.4 and np.mean(error > 5 * joined.sigma[sure]) < 0.1
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.7, 1.3])
+def test_normals_that_are_too_flat_or_too_steep_everywhere_get_the_relief_of_the_depth(device, factor):
+    """Slopes of 0.7 or 1.3 times the true ones, which are 4 to 5° off; what is left is the noise of 0.5° and drift of 1°."""
+    given = drifting(WAVE.normal, noise=NOISE, drift=1) * np.array([factor, factor, 1.0])[:, None, None]
+    given /= np.linalg.norm(given, axis=0)
+    everywhere = np.ones(WAVE.z.shape, bool)
+    depth = -WAVE.z + SIGMA * np.random.default_rng(1).standard_normal(WAVE.z.shape)
+    angle, metres = np.full(WAVE.z.shape, np.radians(NOISE)), np.full(WAVE.z.shape, SIGMA)
+    joined = join_depth(given, angle, everywhere, depth, metres, everywhere, WAVE.x, WAVE.y, perspective=False, device=device)
+    assert joined.relief.factor == (1.0 if factor == 1 else pytest.approx(1 / factor, rel=0.03))
+    assert joined.noise_factor < 1.1 and not any(joined.relief.shift_px)
+    assert degrees_between(joined.normal, WAVE.normal).mean() < 1.2  # 1.1° of noise and drift were given
+
+
+def test_normals_that_are_turned_alike_are_not_taken_for_a_shifted_depth(device):
+    """An egg whose normals are turned by 5° looks as if it stood 1.7 px aside; the depth turns them back."""
+    made = surface("egg", np.random.default_rng(0))
+    half = made.mask.shape[0] / 2 * MM
+    true, z = np.moveaxis(made.normal, -1, 0), made.points[..., 2] * half
+    given = np.einsum("ij,jrc->irc", Rotation.from_rotvec((0.06, 0.06, 0)).as_matrix(), true)
+    depth = 0.5 - z + SIGMA * np.random.default_rng(1).standard_normal(z.shape)
+    joined = join_depth(given, np.full(z.shape, np.radians(NOISE)), made.mask, depth, np.full(z.shape, SIGMA), made.mask,
+                        made.points[..., 0] * half, made.points[..., 1] * half, perspective=False, device=device)
+    error = np.abs(joined.height - z + 0.5)[made.mask]
+    assert not any(joined.relief.shift_px) and degrees_between(joined.normal, true)[made.mask].mean() < 2.0
+    assert np.sqrt((error**2).mean()) < LEAST_RATIO * SIGMA and np.median(joined.sigma[made.mask]) < LEAST_RATIO * SIGMA
 
 
 def test_where_depth_is_missing_normals_carry_on(device):
