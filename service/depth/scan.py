@@ -14,6 +14,7 @@ from kernels.tof.histogram.returns import find_returns
 from kernels.tof.histogram.undeclared_pileup import estimate_pulses
 from service.asset.usd.depth_asset import write_points
 from service.depth.base.solution import srgb_bytes, white_of
+from service.depth.passes import compare_passes
 from service.depth.tof.count_scale import estimate_count_scale
 from service.depth.tof.histograms import pile_up_warning, scale_warnings
 from service.errors import RequestError
@@ -67,6 +68,11 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     if len(points) == 0:
         raise RequestError(f"{shots.folder / FILE_NAME}: no shot gives a point: {int((~covered).sum())} lie outside the track in time, "
                            f"{int((~inside).sum())} outside the span of ranges")
+    timings.stage("passes", 1)
+    passes = compare_passes(shots, index, range_m)
+    if passes is not None:
+        facts["passes"] = {"apart_m": float(f"{passes.apart_m:.3g}"), "within_m": float(f"{passes.within_m:.3g}")}
+        warnings += [sentence for sentence in (passes.warning(),) if sentence]
     shots_used = len(np.unique(index))
     counts = {"shots": len(shots.time_s), "with_points": shots_used, "points": len(points),
               "out_of_range": int((~inside).sum()), "outside_track": int((~covered).sum())}

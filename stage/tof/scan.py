@@ -15,6 +15,8 @@ from stage.transforms import Transform
 
 FILE_NAME = "scan.json"
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+DEGREES = 4 * np.pi
+"""Azimuths beyond it are in degrees, or turns that were counted on, which do not come back."""
 COLUMNS = "time_s, azimuth_rad, elevation_rad"
 
 
@@ -123,6 +125,10 @@ def read_scan(path: str | Path) -> Shots:
     values = shots.astype(np.float64).T
     if not np.isfinite(values[:3]).all():
         raise ImageError(f"{folder / scan.shots}: has times or angles that are not finite")
+    if (reach := float(np.abs(values[2]).max())) > 2 * np.pi:
+        raise ImageError(f"{folder / scan.shots}: elevation_rad reaches {reach:.3g}: give angles in radians")
+    if (reach := float(np.abs(values[1]).max())) > DEGREES and (np.diff(values[1]) > 0).any() and (np.diff(values[1]) < 0).any():
+        raise ImageError(f"{folder / scan.shots}: azimuth_rad reaches {reach:.3g}, to and fro: give angles in radians")
     if scan.waveforms is None:
         return Shots(scan, folder, values[0], values[1], values[2], values[3], values[4], None)
     waveforms = read_array(folder / scan.waveforms.file)
