@@ -27,6 +27,7 @@ RETURNS = 60_000
 PLACES = 1500
 """Places at which planes are fitted."""
 NEIGHBOURS = 96
+"""Returns around a place, among which are those of other passes."""
 OWN, OTHER = 0.02, 0.05
 """Parts of the duration within which returns are of one pass, and beyond which they are of another."""
 OF_PLANE = 10
@@ -34,8 +35,9 @@ OF_PLANE = 10
 FLAT = 0.2
 """Largest deviation from a plane, as a part of the smaller extent of its returns."""
 LEAST_PLACES = 100
-APART = 2.0
-"""Distance between passes over the scatter within one above which they contradict each other."""
+APART, LEAST_M = 2.0, 1e-3
+"""Distance between passes over the scatter within one above which they contradict each other, and the least scatter that counts: no scanner
+has less, but simulated ones have none."""
 EXPLAINED = 0.5
 """Distance between passes with another declaration, over that with the given one, below which it is named."""
 
@@ -79,7 +81,7 @@ def compare_passes(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> Pass
     if planes is None:
         return None
     apart_m, within_m = _apart(planes, world_points(shots, index, range_m)[0])
-    if apart_m <= APART * within_m:
+    if apart_m <= APART * max(within_m, LEAST_M):
         return Passes(apart_m, within_m, None)
     explanation = _declared_otherwise(shots, index, range_m, apart_m / planes.size)
     return Passes(apart_m, within_m, explanation or _off(shots, index, range_m, planes, apart_m))
@@ -139,8 +141,7 @@ def _declared_otherwise(shots: Shots, index: np.ndarray, range_m: np.ndarray, le
         score = _score(change(shots), index, range_m)
         if score < best:
             best, clause = score, name
-    score = _score(shots, index, range_m / 1000)
-    if score < best:
+    if _score(shots, index, range_m / 1000) < best:
         clause = "range_m is in millimetres"
     return f"they meet if {clause}" if clause else ""
 

@@ -55,9 +55,9 @@ def correct(
     value = np.full(difference.shape, (weight * np.where(known, difference, 0)).sum() / weight.sum())
     variance = np.full(difference.shape, 1 / weight.sum())
     cover, shared = inside.astype(np.float64), 0.0
-    sides = 2.0 ** np.arange(int(np.ceil(np.log2(max(difference.shape)))) + 1)
-    drift = (np.hypot(slope_error, DRIFT * np.minimum(2 * sides / max(difference.shape), 1) ** 2) * sides) ** 2
     levels = max(1, int(np.ceil(np.log2(max(difference.shape)))))
+    sides = 2.0 ** np.arange(levels)
+    drift = (np.hypot(slope_error, DRIFT * np.minimum(2 * sides / max(difference.shape), 1) ** 2) * sides) ** 2
     for level in range(levels - 1, -1, -1):
         for again in range(PASSES):
             weights = sum_cells(weight, level)
