@@ -1,7 +1,7 @@
 """Separate the direct from the global light of a capture and write separation.exr and report.json.
 
 The way of the data: the frames of one sinusoid in each axis (`choose_sinusoids`) → kernels/structured/separation.py, band by band, which
-holds the equations and their source → the mean over the axes → a check against the white frame → the files.
+holds the equations and their source → the mean over the axes → checks of the waves and against the white frame → the files.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from kernels.structured.pattern_frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
 from service.depth.base.solution import statistics
 from service.depth.depth import content_of
+from service.depth.wave_check import WaveCheck
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -79,6 +80,7 @@ class SeparationResult(NamedTuple):
     """Global light over all light at the lit pixels: 5th percentile, median and 95th; empty if none is lit."""
     counts: dict[str, int]
     """Number of pixels of the mask with each status."""
+    warnings: tuple[str, ...]
 
 
 def separate(request: SeparateRequest, progress: Progress | None = None) -> SeparationResult:
@@ -108,7 +110,8 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     if series is not None:
         timings.stage("exposures", len(frames))
         joined = JoinedExposures(capture, series, timings.advance)
-    light = _separate_frames(capture, frames, joined, collected, sinusoids, period_px, request, device, timings)
+    check = WaveCheck(int(np.prod(capture.camera.resolution)))
+    light = _separate_frames(capture, frames, joined, collected, sinusoids, period_px, request, device, timings, check)
     mask, solved = capture.mask(), light.status == OK
     counts = {name: int((light.status[mask] == code).sum()) for name, code in (("ok", OK), ("saturated", Status.SATURATED))}
     if not solved.any():
@@ -118,6 +121,7 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     if ratio is not None and abs(ratio - 1) > SUM_TOLERANCE:
         raise ManifestError(f"{capture.folder}: direct and global light add up to {ratio:.2f} of the white frame: the patterns must be "
                             "linear in light (relit patterns --gamma, color_space), and ambient light needs a black or an off frame")
+    warnings = [*clipping_sentences(capture.clipped), *check.faults()]
     timings.stage("write", 1)
     content = content_of(capture)
     path, report_path = request.out / SEPARATION_FILE, request.out / REPORT_FILE
@@ -142,10 +146,10 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         global_share=share,
-        warnings=clipping_sentences(capture.clipped),
+        warnings=warnings,
         global_below_0=int((light.indirect[solved] < 0).any(axis=-1).sum()),
     ))
-    return SeparationResult(path, report_path, period_px, share, counts)
+    return SeparationResult(path, report_path, period_px, share, counts, tuple(warnings))
 
 
 def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[float, tuple[Sinusoid, ...]]:
@@ -173,7 +177,7 @@ def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[flo
 
 def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposures | None, collected: Collected,
                      sinusoids: tuple[Sinusoid, ...], period_px: float, request: SeparateRequest, device: str,
-                     timings: Timings) -> LightParts:
+                     timings: Timings, check: WaveCheck) -> LightParts:
     """Read the frames and separate them band by band; the parts are the mean over the axes."""
     black = () if collected.black is None else (collected.black,)
     used = [*(number for sinusoid in sinusoids for number in sinusoid.frames), *black]
@@ -186,7 +190,12 @@ def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposu
         timings.stage("separate", len(mask))
         for band in planes.bands(BYTES_PER_PIXEL):
             bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, band].reshape(len(used), -1))
-            readings = upload(planes.band(band), bits, device=device)
+            values = planes.band(band)
+            usable = mask[band].reshape(-1)
+            if planes.saturated is not None:
+                usable = usable & ~planes.saturated[:, band].reshape(len(used), -1).any(axis=0)
+            check.add(values, usable, [([place[number] for number in sinusoid.frames], sinusoid.shifts) for sinusoid in sinusoids])
+            readings = upload(values, bits, device=device)
             parts = [separate_band(readings, [place[number] for number in sinusoid.frames], sinusoid.shifts, period_px=period_px,
                                    black=place[black[0]] if black else None, leak=request.black_level) for sinusoid in sinusoids]
             shape = mask[band].shape

@@ -60,6 +60,7 @@ def _separate(result: Any) -> None:
     print(f"report   {result.report_path}")
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
     print(f"pixels   {counted(result.counts)}")
+    print_warnings(result.warnings)
 
 
 def _scan(result: Any) -> None:

@@ -100,6 +100,26 @@ def test_light_of_several_exposures_comes_back(relit, tmp_path):
             assert np.sqrt((error**2).mean()) < 7**0.5 * 1.15 * sigma, rows
 
 
+BOTH = [*phases(), *phases(axis="row"), BLACK]
+
+
+@pytest.mark.parametrize(("patterns", "gamma", "factors", "words"), [
+    (BOTH, 1.0, {}, None),
+    ([*phases(), BLACK], 2.2, {}, "of their amplitude off a sinusoid"),
+    (BOTH, 1.0, {2: 1.3}, "of their amplitude off a sinusoid"),
+    ([*phases(steps=3), *phases(axis="row", steps=3), BLACK], 1.0, {0: 1.2, 1: 1.2, 2: 1.2}, "of columns and of rows differs by 18 %"),
+], ids=["right", "gamma", "a frame brighter", "columns brighter"])
+def test_waves_that_are_none_are_said(relit, tmp_path, patterns, gamma, factors, words):
+    write(tmp_path, patterns, gamma=gamma, ambient=0.02)
+    random = np.random.default_rng(5)
+    for number in range(len(patterns)):
+        image, _ = exr.read(tmp_path / f"{number}.exr")
+        pixels = np.stack([image[channel] for channel in "RGB"], axis=-1) * factors.get(number, 1.0)
+        write_exr(tmp_path / f"{number}.exr", pixels + random.normal(0, 0.002, pixels.shape))
+    warnings = solve(relit, tmp_path)[4].get("warnings", [])
+    assert (warnings == []) if words is None else any(words in sentence for sentence in warnings), warnings
+
+
 def test_the_black_level_of_the_paper(relit, tmp_path):
     write(tmp_path, phases(), leak=0.04)
     direct, indirect, _, _, report = solve(relit, tmp_path, "--black-level", 0.04)
