@@ -51,6 +51,8 @@ class LaserPlanes(NamedTuple):
     """Beside the first manifest; each manifest has one."""
     rows: list[tuple[str, ...]]
     """Frame, tilt and residual of each plane, and its points or how sure depths on it are, the least sure first."""
+    warnings: tuple[str, ...]
+    """What was left out."""
 
 
 class MeasuredPlane(NamedTuple):
@@ -67,9 +69,9 @@ class MeasuredPlane(NamedTuple):
 
 
 class _OnTarget(NamedTuple):
-    """The planes that a target gives, and what the report says of its poses."""
+    """The planes that a target gives, or why it gives none, and what the report says of its poses."""
 
-    planes: list[MeasuredPlane]
+    planes: Sequence[MeasuredPlane | CalibrationError]
     seen: dict[str, Any]
 
 
@@ -119,16 +121,23 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
             if len(points):
                 stripes[index].append(points)
         timings.advance(number)
-    planes = []
+    planes: list[MeasuredPlane | CalibrationError] = []
     for index, frame in enumerate(frames):
         try:
             plane = fit_light_plane(stripes[index])
         except CalibrationError as error:
-            raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
+            if not request.drop_failed:
+                raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}; --drop-failed leaves such frames out"
+                                       ) from error
+            planes.append(error)
+            continue
         planes.append(MeasuredPlane(
             plane.point, plane.normal, plane.sigma_m, plane.sigma_degrees,
             {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points},
             (f"{1000 * plane.residual_m:.3f} mm", f"{plane.points} points")))
+    failed = [plane for plane in planes if isinstance(plane, CalibrationError)]
+    if len(failed) == len(planes):
+        raise CalibrationError(f"{captures[0].folder}: frames: no plane is told by the boards: {failed[0]}")
     return _OnTarget(planes, {"boards": boards})
 
 
@@ -272,7 +281,8 @@ def _even_light(capture: Capture, correction: Correction) -> np.ndarray | None:
 
 def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Path, ...], found: _OnTarget) -> LaserPlanes:
     planes = found.planes
-    entries = [{"point_m": digits(plane.point), "normal": digits(plane.normal), **plane.facts} for plane in planes]
+    entries = [{"dropped": str(plane)} if isinstance(plane, CalibrationError) else
+               {"point_m": digits(plane.point), "normal": digits(plane.normal), **plane.facts} for plane in planes]
     reports = []
     for target, path in zip(targets, paths, strict=True):
         waiting = iter(planes)
@@ -280,6 +290,8 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Pat
         for frame in target.manifest.frames:
             if isinstance(frame.laser, LaserPlane):
                 plane = next(waiting)
+                if isinstance(plane, CalibrationError):
+                    continue
                 (px, py, pz), (nx, ny, nz) = digits(plane.point), digits(plane.normal)
                 laser = LaserPlane(type="plane", point_m=(px, py, pz), normal=(nx, ny, nz),
                                    accuracy_deg=float(f"{plane.sigma_degrees:.3g}"), accuracy_m=float(f"{plane.sigma_m:.3g}"))
@@ -287,7 +299,9 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Pat
             frames.append(frame)
         reports.append(write_results("laser-planes", request, target.manifest.model_copy(update={"frames": tuple(frames)}),
                                      path, {**found.seen, "planes": entries}))
-    order = sorted(range(len(planes)), key=lambda index: planes[index].sigma_degrees, reverse=True)
-    names = [frame.image for frame in _laser_frames(targets[0])]
-    rows: list[tuple[str, ...]] = [(names[index], f"{planes[index].sigma_degrees:.3f}°", *planes[index].words) for index in order]
-    return LaserPlanes(paths, reports[0], rows)
+    named = list(zip([frame.image for frame in _laser_frames(targets[0])], planes, strict=True))
+    measured = sorted(((name, plane) for name, plane in named if isinstance(plane, MeasuredPlane)),
+                      key=lambda pair: pair[1].sigma_degrees, reverse=True)
+    rows: list[tuple[str, ...]] = [(name, f"{plane.sigma_degrees:.3f}°", *plane.words) for name, plane in measured]
+    return LaserPlanes(paths, reports[0], rows, tuple(f"frames of {name}: {plane}; they are left out" for name, plane in named
+                                                      if isinstance(plane, CalibrationError)))

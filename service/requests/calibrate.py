@@ -301,9 +301,13 @@ class LaserPlanesOptions(MarkerOptions):
     """Side of a square of the board in metres."""
     step_m: Annotated[Positive | None, StepHeight] = None
     """Height in metres of a right-angled block on a flat base, which needs no board."""
+    drop_failed: bool = False
+    """Leave out frames whose plane the boards do not tell, in place of refusing all of them."""
 
     @model_validator(mode="after")
     def _one_target(self) -> Self:
+        if self.drop_failed and self.step_m is not None:
+            _refuse("--drop-failed is for boards: the planes on a step are found together")
         if (self.board is None) != (self.square_m is None):
             _refuse("--board and --square-m belong together: give both, or --step-m")
         if (self.board is None) == (self.step_m is None):

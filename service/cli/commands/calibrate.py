@@ -103,6 +103,7 @@ def _stereo(result: Any) -> None:
 def _laser_planes(result: Any, request: LaserPlanesRequest) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
+    print_warnings(result.warnings)
 
 
 def _response(result: Any) -> None:

@@ -100,6 +100,23 @@ def test_stripes_that_leave_the_board_do_not_turn_their_plane(relit, tmp_path, s
 
 
 @pytest.mark.long
+def test_a_plane_that_misses_the_boards_is_left_out_on_request(relit, tmp_path):
+    beside = (PLANES[0][0], np.array((1.0, 0.05, 0.05)))
+    folders = boards(tmp_path, POSES, [*PLANES, beside])
+    before = (folders[0] / "capture.json").read_bytes()
+    outcome = calibrated(relit, folders)
+    assert outcome.code == 2 and "3.exr" in outcome.err and "--drop-failed leaves such frames out" in outcome.err
+    assert (folders[0] / "capture.json").read_bytes() == before
+    outcome = calibrated(relit, folders, "--drop-failed")
+    assert (outcome.code, outcome.err) == (0, "") and "frames of 3.exr" in outcome.out
+    frames = Capture.open(folders[0]).manifest.frames
+    assert [frame.image for frame in frames if frame.laser is not None] == ["0.exr", "1.exr", "2.exr"]
+    entries = json.loads((folders[0] / "calibration.json").read_text())["laser-planes"]["planes"]
+    assert ["dropped" in entry for entry in entries] == [False, False, False, True]
+    assert "--drop-failed is for boards" in relit.refused("calibrate", "laser-planes", *folders, "--step-m", 0.05, "--drop-failed")
+
+
+@pytest.mark.long
 def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
     folders = boards(tmp_path)
     before = [(folder / "capture.json").read_bytes() for folder in folders]
