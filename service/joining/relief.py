@@ -15,6 +15,8 @@ from stage.spread import MAD_TO_SIGMA, between_blocks
 
 WIDE = 5
 """Scale of what is taken away, cells of 2^5 pixels."""
+MOST_PIXELS = 300_000
+"""Pixels that are compared."""
 ROUNDS = 10
 """Fits, each with the Cauchy weights of the one before."""
 SURE = 6.0
@@ -44,10 +46,12 @@ def compare_relief(height: np.ndarray, sigma: np.ndarray, base: np.ndarray, know
     rows, cols = np.nonzero(inside)
     if len(rows) < (1 << 2 * WIDE):
         return Relief(1.0, (0.0, 0.0))
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), MOST_PIXELS)).astype(int)
+    rows, cols = rows[chosen], cols[chosen]
     bend = sum(np.gradient(each, axis=axis) for each, axis in zip(slope, (1, 0), strict=True))  # of a depth that was smoothed
-    fine = [_fine(plane, inside)[inside] for plane in (height - base, base, -slope[0], -slope[1], np.asarray(bend))]
+    fine = [_fine(plane, inside)[rows, cols] for plane in (height - base, base, -slope[0], -slope[1], np.asarray(bend))]
     design, left = np.stack(fine[1:], axis=1), fine[0]
-    weight = 1 / sigma[inside] ** 2
+    weight = 1 / sigma[rows, cols] ** 2
     trust = np.ones(len(left))
     for _ in range(ROUNDS):
         used = weight * trust
