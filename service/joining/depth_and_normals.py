@@ -26,8 +26,8 @@ LEAST_DEPTHS = 12
 
 
 
-MOST_NOISE = 1000.0
-"""The largest factor of the noise that is looked for."""
+MOST_NOISE, MOST_EDGES = 1000.0, 300_000
+"""The largest factor of the noise that is looked for, and the edges that tell it."""
 
 
 class Joined(NamedTuple):
@@ -147,6 +147,7 @@ def noise_over_sigma(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, ri
         noise.append((_head(sigma, axis) ** 2 + _tail(sigma, axis) ** 2)[held])
         slope.append(_head(edges.sigma, axis)[held] ** 2)
     found, own, other = (np.concatenate(each) for each in (squares, noise, slope))
+    found, own, other = (each[::max(1, len(found) // MOST_EDGES)] for each in (found, own, other))
 
     def beyond(factor: float) -> float:
         return MAD_TO_SIGMA * float(np.sqrt(np.median(found / (factor**2 * own + other)))) - 1
