@@ -92,6 +92,9 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
     warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
     used = [number for number, placing in enumerate(placings) if not (placing.misplaced and request.misplaced is Misplaced.LEAVE_OUT)]
+    if len(scans) > 1 and request.misplaced is Misplaced.LEAVE_OUT and all(placing.compared < LEAST_COMMON for placing in placings):
+        raise RequestError(f"{file}: scans[].scan_to_world: no two of the {len(scans)} scans have a surface in common: look whether the "
+                           "poses are world_to_scan, and that lengths are in metres; --misplaced keep fuses scans of several things")
     if 2 * len(used) < len(scans) + (len(scans) == 2) or not used:
         raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
 

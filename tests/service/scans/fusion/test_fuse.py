@@ -138,6 +138,9 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]
     refused("the poses contradict each other: run relit register first",
             scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
+    around = shots[::6]
+    inverted = write_scans(tmp_path, around, poses=[np.linalg.inv(shot.world_from_camera) for shot in around])
+    refused(f"no two of the {len(around)} scans have a surface in common: look whether the poses are world_to_scan", scan_set=inverted)
     assert not (tmp_path / "out").exists()
 
 
