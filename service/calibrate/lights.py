@@ -23,7 +23,7 @@ from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_poi
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction
-from service.light_estimation.semi_calibrated import check_directions, fit_intensities
+from service.light_estimation.semi_calibrated import check_directions, fit_intensities, part_uncertainty
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
 from stage.capture.light import DistantLight, PointLight
@@ -35,6 +35,8 @@ ANALYSER_GAIN = 2.0
 """Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""
 READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
+UNSURE = 0.05
+"""Median uncertainty of the brightness of lights, relative, from which the object is said to be none to measure them on."""
 BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
@@ -248,10 +250,11 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
     timings.stage("fit", 1)
     try:
         found = fit_intensities(readings, usable, directions)
+        uncertainty = part_uncertainty(readings, usable, directions, found.irradiance)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
     results: list[MeasuredLight | CalibrationError] = []
-    for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, found.uncertainty, strict=True):
+    for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, uncertainty, strict=True):
         assert isinstance(lit.light, DistantLight)
         if np.isnan(rgb).any():
             results.append(CalibrationError("too few pixels of the object are lit by this light to tell its brightness"))
@@ -262,5 +265,9 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
         results.append(MeasuredLight(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
     timings.close()
     measured = leave_out_failures(captures, results, drop_failed=request.drop_failed)
+    unsure = float(np.median([result.doubt for result in measured if result.light is not None]))
+    warnings = () if unsure < UNSURE else (
+        f"lights: parts of the object ask for lights that differ by {100 * unsure:.0f} %, as where it is glossy, rough, velvet or metal, "
+        "or in shadow: measure them on a grey ball (relit calibrate grey-ball)",)
     return write_lights("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
-                        summary={"pixels": found.pixels}, relative=True)
+                        summary={"pixels": found.pixels}, relative=True, warnings=warnings)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.grey_ball import WEIGHT_SCALE
-from service.light_estimation.lambertian import SHADOW, bright_readings, least_squares, normal_equations
+from service.light_estimation.lambertian import SHADOW, bright_readings, fit_lambertian, least_squares, normal_equations
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -32,6 +32,11 @@ LINEAR_ROUNDS = range(6, 12)
 """The rounds that solve the eigenvalue problem."""
 CONVERGED = 1e-4
 """The largest relative change of a light in the last round, a hundredth of the uncertainty on real surfaces."""
+PARTS, LEAST_PARTS = 6, 3
+"""Parts of an object, by how much its pixels face the viewer, whose lights are compared, and how many of them must tell a light."""
+IN_COMMON = 2.0
+"""What parts of an object have in common, over what they differ by: of 40 objects, matt ones to metal, errors are .2 of what this makes of
+the differences in the median, and 1.8 at most."""
 TINY = 1e-200
 """A number below any reading, which avoids division by zero."""
 
@@ -41,7 +46,6 @@ class Intensities(NamedTuple):
 
     irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the measured lights in each channel
     residual: np.ndarray  # [lights, 3] float64, weighted root mean square of the residual over |b|
-    uncertainty: np.ndarray  # [lights, 3] float64, standard error relative to the value, from that residual
     pixels: int
     """The count of pixels that were used."""
 
@@ -61,11 +65,36 @@ def fit_intensities(
 ) -> Intensities:
     """Measure the irradiance of every light, up to one factor in each channel.
     Raises CalibrationError if there are too few lights or pixels, or the directions do not determine the brightness."""
-    result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
+    result = [np.full((len(directions), 3), np.nan) for _ in range(2)]
     told, fits = _fit_channels(readings, usable, directions, "RGB")
     for part, values in enumerate(result):
         values[told] = np.stack([fit[part] for fit in fits], axis=-1)
-    return Intensities(result[0], result[1], result[2], min(fit[3] for fit in fits))
+    return Intensities(result[0], result[1], min(fit[2] for fit in fits))
+
+
+def part_uncertainty(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of the brightness of lights, [lights, 3] relative to the value, from what parts of the object ask for.
+
+    A surface that is not quite Lambertian asks for wrong lights, and leaves next to no residual; where it faces the viewer it asks for
+    other ones than where it turns away. 1 where fewer than LEAST_PARTS tell. The arguments are those of `fit_intensities`, and its result.
+    """
+    told = np.isfinite(irradiance).all(axis=1)
+    grey = (readings[told] / irradiance[told, None]).mean(axis=2)
+    facing = fit_lambertian(grey, usable[told], directions[told]).normal[2]
+    asked = []
+    for part in np.array_split(np.argsort(facing), PARTS):
+        try:
+            found = fit_intensities(readings[:, part], usable[:, part], directions).irradiance
+        except CalibrationError:
+            continue
+        ratio = np.log(found / irradiance)
+        known = np.isfinite(ratio).all(axis=1)
+        asked.append(ratio - ratio[known].mean(axis=0) if known.any() else ratio)
+    if len(asked) < LEAST_PARTS:
+        return np.ones_like(irradiance)
+    enough = np.isfinite(asked).sum(axis=0) >= LEAST_PARTS
+    own = np.nanvar(np.where(enough, asked, 0), axis=0)  # of six values: half of it is that of all lights
+    return np.where(enough, IN_COMMON * np.sqrt((own + own.mean(axis=0)) / 2), 1.0)
 
 
 def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, *, rounds: int = ROUNDS) -> np.ndarray:
@@ -80,7 +109,7 @@ def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: n
 
 
 def _fit_channels(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray,
-                  names: Sequence[str], rounds: int = ROUNDS) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]]:
+                  names: Sequence[str], rounds: int = ROUNDS) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, int]]]:
     """Return the lights that enough pixels show, and the fit of each channel to them."""
     check_directions(directions)
     told = np.arange(len(directions))
@@ -111,8 +140,8 @@ def check_directions(directions: np.ndarray) -> None:
 
 
 def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray,
-                 name: str, rounds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Return the irradiance [lights] of one channel, its residual, its uncertainty, and the count of pixels.
+                 name: str, rounds: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the irradiance [lights] of one channel, its residual, and the count of pixels.
 
     Each channel is fitted alone: under lights of different colours the grey of a coloured surface is no product of light and albedo.
     """
@@ -141,7 +170,7 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
     error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
     total = weight.sum(axis=1)
     residual = np.sqrt((weight * error**2).sum(axis=1) / total)
-    return e, residual, residual / np.sqrt(total), count
+    return e, residual, count
 
 
 def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:
