@@ -40,6 +40,10 @@ MOST_ENCODED = 1.001
 """The largest value of display-encoded images, but for rounding."""
 
 
+PARTS, IN_COMMON = 4, 0.5
+"""Parts of the lit side of a ball, by how they face the light, and what they have in common over what they differ by."""
+
+
 class Brightness(NamedTuple):
     """The brightness of one light on a grey ball."""
 
@@ -55,7 +59,7 @@ class Shading(NamedTuple):
 
     direction: np.ndarray  # [3] float64, unit
     uncertainty_degrees: float
-    """The standard error from the scatter of the readings; the error of a ball that is not Lambertian is larger."""
+    """The standard error, from the scatter of the readings and from what parts of the ball differ by in the direction that they ask for."""
 
 
 def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
@@ -139,7 +143,19 @@ def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: Ball
     direction = b / length
     across = np.eye(3) - np.outer(direction, direction)
     variance = float((w * (y - n @ b) ** 2).sum() / w.sum())
-    return Shading(direction, math.degrees(math.sqrt(variance * np.trace(across @ np.linalg.inv(gram) @ across)) / length))
+    scatter = math.degrees(math.sqrt(variance * np.trace(across @ np.linalg.inv(gram) @ across)) / length)
+    apart = [_angle(direction, _shading(n[part], y[part], w[part])) for part in np.array_split(np.argsort(n @ direction), PARTS)]
+    return Shading(direction, math.hypot(scatter, IN_COMMON * math.sqrt(np.mean(np.square(apart)))))
+
+
+def _shading(normal: np.ndarray, reading: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the b that b·n = reading has by weighted least squares, the shorter of many where they do not determine it."""
+    root = np.sqrt(weight)
+    return np.asarray(np.linalg.lstsq(normal * root[:, None], reading * root, rcond=1e-6)[0])
+
+
+def _angle(one: np.ndarray, other: np.ndarray) -> float:
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other)))
 
 
 def _usable(saturated: np.ndarray | None, view: BallView) -> np.ndarray:

@@ -209,6 +209,17 @@ def test_noise_saturation_and_highlights():
     np.testing.assert_allclose(fit_brightness(clipped, saturated, distant(direction), view).scale, true, rtol=2e-3)
 
 
+@pytest.mark.parametrize("rim", [0.2, 0.5])
+def test_the_uncertainty_holds_what_a_ball_that_is_not_lambertian_makes(rim):
+    """A ball that is brighter towards its outline, by 20 and by 50 %, turns lights from it by degrees; its readings hardly scatter."""
+    view, geometry = exact("orthographic")
+    for direction in spread(6, 0.3):
+        image = box(seen(lambertian(direction), geometry), view) * (1 + rim * (1 - view.normal[..., 2:]))
+        shading = fit_direction(image, None, view)
+        off = angles_degrees(shading.direction, direction)
+        assert off < 2 * shading.uncertainty_degrees + 0.05, (off, shading.uncertainty_degrees)
+
+
 def test_balls_that_show_nothing():
     view, geometry = exact("orthographic")
     image = box(seen(lambertian(unit(0, 0, 1)), geometry), view)
