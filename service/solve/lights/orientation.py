@@ -5,6 +5,7 @@ slopes are those of one height (service.solve.lights.axes), and the outline and 
 (service.solve.lights.object_outline).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -97,7 +98,7 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
         return None
     inward, decided = _is_clear(edge), None
     if lights is not None:
-        decided = _is_inverted(_Shadows(given, solution, small, lights), edge, len(lights.direction))
+        decided = _is_inverted(_Shadows(given, solution.normal, small, lights), edge, len(lights.direction))
     if decided:
         return LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that "
                          "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
@@ -105,6 +106,25 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
         return None
     return LightAxes("along the outline the normals point inwards: the object is hollow there, or x and y of the lights are both negated "
                      "(turned by 180° about the view axis); nothing else in the images decides")
+
+
+def is_upright(given: SolveInput, lights: DistantLights, normals: Callable[[np.ndarray], np.ndarray]) -> bool | None:
+    """Return whether the images have the cast shadows of a surface, or those of its inverse; None where they do not tell.
+    `normals`: returns the normals [3, n] of pixels [n], seen by an orthographic camera."""
+    pixels, inside = _grid(given.mask, MAP_SIZE)
+    normal = np.zeros((3, given.mask.size), np.float32)
+    found = normals(pixels[inside])
+    told = np.isfinite(found).all(axis=0)
+    inside[inside] = told
+    normal[:, pixels[inside]] = found[:, told]
+    small = _Map(np.where(inside, normal[:, pixels.reshape(-1)].reshape(3, *pixels.shape), 0), inside, pixels)
+    if not inside.any():
+        return None
+    shadows = _Shadows(given, normal, small, lights)
+    (count, lit), (count_inverse, lit_inverse) = shadows.of_surface(), shadows.of_inverse()
+    if min(count, count_inverse) < LEAST_SHADOWS_ALONE or min(lit, lit_inverse) >= LIT_WRONG or abs(lit - lit_inverse) < MORE_LIT:
+        return None
+    return lit < lit_inverse
 
 
 def _is_inverted(shadows: "_Shadows", edge: Outline, lights: int) -> bool | None:
@@ -172,8 +192,9 @@ def _is_clear(edge: Outline) -> bool:
 class _Shadows:
     """The cast shadows of a surface and of its inverse, compared with readings."""
 
-    def __init__(self, given: SolveInput, solution: Solution, small: _Map, lights: DistantLights) -> None:
-        """Integrate a small map, and read some of its pixels under some of the lights."""
+    def __init__(self, given: SolveInput, normal: np.ndarray, small: _Map, lights: DistantLights) -> None:
+        """Integrate a small map, and read some of its pixels under some of the lights.
+        `normal`: [3, pixels of the image], known at those of the small map."""
         rows, cols = small.mask.shape
         across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
         self._height = to_numpy(integrate_normals(
@@ -186,7 +207,7 @@ class _Shadows:
         radiance, usable = given.stack.pick_radiance(pixels)
         readings = grey_readings(radiance[some], lights.irradiance[some])
         self._direction = lights.direction[some]
-        cosine = self._direction @ solution.normal[:, pixels]
+        cosine = self._direction @ normal[:, pixels]
         level = median_of(readings / np.maximum(cosine, LEVEL_COSINE), (cosine > LEVEL_COSINE) & usable[some])
         self._compared = (cosine > LEAST_COSINE) & usable[some] & (level > 0)
         self._lit = readings > LIT * level * cosine

@@ -13,7 +13,7 @@ from service.light_estimation.lambertian import SHADOW, bright_readings
 from service.solve.base.solution import PIXELS_AT_ONCE, SolveInput
 from service.solve.lights.factorisation import factorise, fit_surface, integrable
 from service.solve.lights.object_outline import outline
-from service.solve.lights.orientation import INVERSE
+from service.solve.lights.orientation import INVERSE, is_upright
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError
@@ -92,6 +92,8 @@ class UnknownLights(NamedTuple):
     """[3, 3] each: from the normals to those without one quarter of the object, up to their length."""
     least_degrees: float
     """Standard error of every normal that the quarters do not show."""
+    two_ways: bool
+    """Whether nothing tells bumps from hollows."""
     facts: dict[str, Any]
     """Facts for the report."""
     warnings: tuple[str, ...]
@@ -106,6 +108,8 @@ class UnknownLights(NamedTuple):
                 cosine = (part * turned).sum(axis=0) / np.maximum(np.linalg.norm(turned, axis=0), 1e-12)
                 angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
                 squares[first : first + PIXELS_AT_ONCE] += (QUARTERS - 1) / QUARTERS * angle**2
+        if self.two_ways:  # half of the times it is the inverse, twice the tilt away
+            squares += 2 * np.degrees(np.arccos(np.clip(normal[2], -1, 1))) ** 2
         return np.sqrt(squares)
 
 
@@ -155,12 +159,16 @@ def find_lights(given: SolveInput) -> UnknownLights:
     outward = _outward(given, factors.lights, matrix)
     if outward < 0:
         matrix, others = INVERSE @ matrix, [INVERSE @ other for other in others]
-    lights = factors.lights @ np.linalg.inv(matrix)
-    strength = np.linalg.norm(lights, axis=1)
-    found = DistantLights(lights / strength[:, None], np.repeat((strength / strength.mean())[:, None], 3, axis=1))
+    found = _lights_of(factors.lights @ np.linalg.inv(matrix))
+    upright = None if abs(outward) >= CLEAR else is_upright(
+        given, found, lambda pixels: _unit(matrix @ fit_surface(*_read(given, pixels), factors.lights)))
+    if upright is False:
+        matrix, others = INVERSE @ matrix, [INVERSE @ other for other in others]
+        found = _lights_of(factors.lights @ np.linalg.inv(matrix))
+    two_ways = abs(outward) < CLEAR and upright is None
     back = np.linalg.inv(matrix)
     least = HIGHLIGHT_DEGREES / relief.told if relief.by == "highlights" else ALBEDO_DEGREES
-    result = UnknownLights(found, tuple(other @ back for other in others), least, {}, _warnings(relief, abs(outward)))
+    result = UnknownLights(found, tuple(other @ back for other in others), least, two_ways, {}, _warnings(relief, two_ways))
     sigma = float(np.median(result.doubt(_unit(matrix @ b))))
     facts = {"resolved_by": relief.by, "told_by_highlights": round(relief.told, 4), "outward": round(abs(outward), 3),
              "misfit": round(factors.misfit, 4), "sigma_degrees": round(sigma, 2), "directions": found.direction.round(5).tolist(),
@@ -168,14 +176,21 @@ def find_lights(given: SolveInput) -> UnknownLights:
     return result._replace(facts={"unknown_lights": facts})
 
 
-def _warnings(relief: Relief, outward: float) -> tuple[str, ...]:
+def _lights_of(lights: np.ndarray) -> DistantLights:
+    """Return lights of [lights, 3] direction × irradiance, of mean irradiance 1."""
+    strength = np.linalg.norm(lights, axis=1)
+    return DistantLights(lights / strength[:, None], np.repeat((strength / strength.mean())[:, None], 3, axis=1))
+
+
+def _warnings(relief: Relief, two_ways: bool) -> tuple[str, ...]:
     found = ["frames[].light: the lights of the manifest were not used: relight, view and export need those that found.unknown_lights of "
              "the report has"]
     if relief.by == "albedo":
         found.append("--lights unknown: the object has no highlights that tell its relief: it was taken for one of few albedos, and may be "
                      "flatter, deeper or tilted; photograph a chrome ball, or give directions")
-    if outward < CLEAR:
-        found.append("--lights unknown: the outline does not tell bumps from hollows: x and y of all normals may be negated")
+    if two_ways:
+        found.append("--lights unknown: neither the outline nor shadows tell bumps from hollows: x and y of all normals may be negated, "
+                     "which sigma holds")
     return tuple(found)
 
 

@@ -10,7 +10,7 @@ from service.requests.solve import SolveRequest
 from service.solve.solve import solve
 from stage.errors import CalibrationError, ManifestError
 from tests.reference import microfacet
-from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, make_scene, write_capture
+from tests.scenes.captures import Scene, angles_degrees, edit_frame, edit_manifest, make_scene, write_capture
 from tests.scenes.ellipsoid import ellipsoid
 
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -24,6 +24,56 @@ def shiny(scene, roughness, f0):
     lobes = np.stack([microfacet.specular(scene.normal, direction, VIEW, alpha, f0) for direction in scene.directions])
     images = scene.images + scene.mask[..., None] * lobes[..., None] * scene.irradiance[:, None, None]
     return scene._replace(images=images)
+
+
+def relief(seed, *, shadows, size=96):
+    """A plate that fills the image, with 14 bumps, two albedos and highlights, under 24 lights 35 to 72° from the view axis."""
+    random = np.random.default_rng(seed)
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, 1 - (np.arange(size) + 0.5) / size * 2)
+    z, slope = np.zeros_like(x), np.zeros((2, size, size))
+    for _ in range(14):
+        (across, up), wide, high = random.uniform(-0.9, 0.9, 2), random.uniform(0.06, 0.12), random.uniform(0.12, 0.25)
+        bump = high * np.exp(-((x - across) ** 2 + (y - up) ** 2) / (2 * wide**2))
+        z, slope = z + bump, slope - bump * np.stack([x - across, y - up]) / wide**2
+    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    albedo = np.repeat((0.3 + 0.4 * (np.sin(7 * x + 1) * np.sin(6 * y + 2) > 0))[..., None], 3, axis=-1)
+    tilt, turn = np.radians(random.uniform(35, 72, LIGHTS)), random.uniform(0, 2 * np.pi, LIGHTS)
+    directions = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
+    images = []
+    for direction in directions:
+        lit = np.ones_like(x, bool)
+        aside = direction[:2] / np.hypot(*direction[:2])
+        for step in np.arange(1, size) if shadows else ():
+            row, col = np.rint(np.mgrid[:size, :size] + step * np.array([-aside[1], aside[0]])[:, None, None]).astype(int)
+            inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
+            above = z[row.clip(0, size - 1), col.clip(0, size - 1)] - z
+            lit &= ~(inside & (above > step * 2 / size * direction[2] / np.hypot(*direction[:2])))
+        lobe = microfacet.specular(normal, direction, VIEW, np.full(x.shape, 0.09), 0.08)
+        images.append((albedo * np.maximum(normal @ direction, 0)[..., None] + lobe[..., None]) * lit[..., None])
+    noisy = np.array(images) / np.max(images) + random.normal(0, 5e-4, (LIGHTS, size, size, 1))
+    return Scene(normal, albedo, np.ones_like(x, bool), directions, np.full((LIGHTS, 3), np.pi), np.maximum(noisy, 0))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_cast_shadows_tell_bumps_from_hollows(tmp_path, seed):
+    """Weak highlights leave the depth and tilt open, with a wide σ; but the inverse, taken as often before, is never nearer."""
+    scene = relief(seed, shadows=True)
+    result, _, error = solved(tmp_path, scene)
+    pixels, normal = np.asarray(result.maps.mask), np.asarray(result.maps.normal)
+    inverse = angles_degrees(normal * [-1, -1, 1], scene.normal)[pixels]
+    assert np.mean(error) < np.mean(inverse) and not any("bumps from hollows" in words for words in result.warnings)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_where_nothing_tells_bumps_from_hollows_sigma_holds_both(tmp_path, seed):
+    """Normals are off by nothing or by twice their tilt."""
+    scene = relief(seed, shadows=False)
+    result, _, _ = solved(tmp_path, scene, max_sigma=180)
+    assert any("bumps from hollows" in words for words in result.warnings)
+    solved_pixels = np.asarray(result.maps.mask)
+    error, sigma = angles_degrees(result.maps.normal, scene.normal)[solved_pixels], np.asarray(result.maps.sigma)[solved_pixels]
+    assert np.median(error / sigma) < 1.5 and np.mean(error > 5 * sigma) < 0.01  # √2 of the RMS of both, where it is the inverse
 
 
 def solved(tmp_path, scene, method="robust", **options):
