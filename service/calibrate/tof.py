@@ -9,6 +9,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.device import to_numpy
+from kernels.photometric.model.samples import evenly
 from kernels.tof.continuous.continuous import decode
 from service.calibrate.results import digits, write_report
 from service.calibrate.solvers.tof_sweep import Fit, StepPhases, all_readings, contradicting, fit_steps, fit_wiggling, target_faults
@@ -228,7 +229,7 @@ def _phases(plan: Sweep, captures: list[Capture], chosen: list[int], device: str
         step, capture = plan.steps[number], captures[number]
         frames = read_correlations(capture)
         inside = np.nonzero(capture.mask().reshape(-1))[0]
-        some = inside[np.linspace(0, len(inside) - 1, min(STEP_PIXELS, len(inside))).astype(int)]
+        some = inside[evenly(len(inside), STEP_PIXELS)]
         noise = estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=capture.camera.width,
                                scale=frames.scale)
         found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise,
@@ -240,6 +241,6 @@ def _phases(plan: Sweep, captures: list[Capture], chosen: list[int], device: str
             good = (sigma[row] > 0) & (sigma[row] < SHARPEST_RAD)
             if good.any():
                 phases.setdefault(hz, {})[number] = StepPhases(phase[row, good].astype(np.float64), true[good], aside[good],
-                                                                   capture.camera.projection == "perspective")
+                                                              capture.camera.projection == "perspective")
         timings.advance(done)
     return phases

@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from kernels.photometric.model.samples import evenly
 from stage.spread import MAD_TO_SIGMA
 from stage.tof.scan import Pose, Shots, world_points
 
@@ -75,22 +76,22 @@ def compare_passes(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> Pass
     `index`: [m] the shot of each return. `range_m`: [m] metres."""
     if len(shots.scan.track) < 2 or len(index) < LEAST_PLACES:
         return None
-    chosen = np.linspace(0, len(index) - 1, min(len(index), RETURNS)).astype(int)
+    chosen = evenly(len(index), RETURNS)
     index, range_m = index[chosen], range_m[chosen]
-    planes = _planes(shots, index, range_m)
+    points = world_points(shots, index, range_m)[0]
+    planes = _planes(points, shots.time_s[index])
     if planes is None:
         return None
-    apart_m, within_m = _apart(planes, world_points(shots, index, range_m)[0])
+    apart_m, within_m = _apart(planes, points)
     if apart_m <= APART * max(within_m, LEAST_M):
         return Passes(apart_m, within_m, None)
     explanation = _declared_otherwise(shots, index, range_m, apart_m / planes.size)
     return Passes(apart_m, within_m, explanation or _off(shots, index, range_m, planes, apart_m))
 
 
-def _planes(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> _Planes | None:
-    points, time = world_points(shots, index, range_m)[0], shots.time_s[index]
+def _planes(points: np.ndarray, time: np.ndarray) -> _Planes | None:
     duration = float(np.ptp(time))
-    places = np.linspace(0, len(points) - 1, min(len(points), 3 * PLACES)).astype(int)
+    places = evenly(len(points), 3 * PLACES)
     away, near = cKDTree(points).query(points[places], k=min(NEIGHBOURS, len(points)))
     apart = np.abs(time[near] - time[places, None]) / max(duration, 1e-12)
     own = np.where(apart <= OWN, away, np.inf)
@@ -104,7 +105,7 @@ def _planes(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> _Planes | N
     nearest, beside = np.take_along_axis(near, first, axis=1)[kept], near[np.arange(len(near)), last.argmax(axis=1)][kept]
     values = np.linalg.eigvalsh(_covariance(points[nearest])[1])
     flat = np.flatnonzero(values[:, 0] <= FLAT**2 * values[:, 1])
-    flat = flat[np.linspace(0, len(flat) - 1, min(len(flat), PLACES)).astype(int)]
+    flat = flat[evenly(len(flat), PLACES)]
     if len(flat) < LEAST_PLACES:
         return None
     return _Planes(nearest[flat], beside[flat], float(np.median(radius[kept][flat])))
@@ -148,8 +149,9 @@ def _declared_otherwise(shots: Shots, index: np.ndarray, range_m: np.ndarray, le
 
 def _score(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> float:
     """Return how far apart passes lie in radii of their places; infinite where there are none."""
-    planes = _planes(shots, index, range_m)
-    return np.inf if planes is None else _apart(planes, world_points(shots, index, range_m)[0])[0] / planes.size
+    points = world_points(shots, index, range_m)[0]
+    planes = _planes(points, shots.time_s[index])
+    return np.inf if planes is None else _apart(planes, points)[0] / planes.size
 
 
 def _inverted(shots: Shots) -> Shots:

@@ -22,10 +22,6 @@ from stage.spread import MAD_TO_SIGMA
 
 LEAST_DEPTHS = 12
 """Number of depths by which a part is placed; one with fewer has no place of its own."""
-
-
-
-
 MOST_NOISE, MOST_EDGES = 1000.0, 300_000
 """The largest factor of the noise that is looked for, and the edges that tell it."""
 

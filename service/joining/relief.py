@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.model.samples import evenly
 from service.joining.cells import interpolated, sum_cells
 from stage.spread import MAD_TO_SIGMA, between_blocks
 
@@ -46,7 +47,7 @@ def compare_relief(height: np.ndarray, sigma: np.ndarray, base: np.ndarray, know
     rows, cols = np.nonzero(inside)
     if len(rows) < (1 << 2 * WIDE):
         return Relief(1.0, (0.0, 0.0))
-    chosen = np.linspace(0, len(rows) - 1, min(len(rows), MOST_PIXELS)).astype(int)
+    chosen = evenly(len(rows), MOST_PIXELS)
     rows, cols = rows[chosen], cols[chosen]
     bend = sum(np.gradient(each, axis=axis) for each, axis in zip(slope, (1, 0), strict=True))  # of a depth that was smoothed
     fine = [_fine(plane, inside)[rows, cols] for plane in (height - base, base, -slope[0], -slope[1], np.asarray(bend))]

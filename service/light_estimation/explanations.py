@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.grey_ball import ENCODINGS, other_readings
-from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, least_squares, median_of
+from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, degrees_between, fit_lambertian, least_squares, median_of
 from service.light_estimation.semi_calibrated import TINY, fit_intensities
 from stage.colour.colour import GREY_WEIGHTS
 from stage.colour.colour_spaces import is_linear
@@ -121,8 +121,7 @@ def _explains(left: float, misfit: float, times: float) -> bool:
 
 
 def _angle(one: Fit, other: Fit) -> float:
-    cosine = np.clip((one.normal * other.normal).sum(axis=0), -1, 1)
-    return float(np.degrees(np.median(np.arccos(cosine))))
+    return float(np.median(degrees_between(one.normal, other.normal)))
 
 
 def grey_readings(radiance: np.ndarray, irradiance: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.ball import BallView
+from service.light_estimation.lambertian import least_squares
 from stage.capture.light import DistantLight, PointLight
 from stage.colour.colour import convert, linearise
 from stage.colour.colour_spaces import is_linear, linear_space
@@ -38,8 +39,6 @@ ENCODINGS = {"srgb_texture": "sRGB", "g22_rec709_scene": "a power of 2.2"}
 curve."""
 MOST_ENCODED = 1.001
 """The largest value of display-encoded images, but for rounding."""
-
-
 PARTS, IN_COMMON = 4, 0.5
 """Parts of the lit side of a ball, by how they face the light, and what they have in common over what they differ by."""
 
@@ -144,14 +143,9 @@ def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: Ball
     across = np.eye(3) - np.outer(direction, direction)
     variance = float((w * (y - n @ b) ** 2).sum() / w.sum())
     scatter = math.degrees(math.sqrt(variance * np.trace(across @ np.linalg.inv(gram) @ across)) / length)
-    apart = [_angle(direction, _shading(n[part], y[part], w[part])) for part in np.array_split(np.argsort(n @ direction), PARTS)]
+    apart = [_angle(direction, least_squares(y[part, None], w[part, None], n[part])[:, 0])
+             for part in np.array_split(np.argsort(n @ direction), PARTS)]
     return Shading(direction, math.hypot(scatter, IN_COMMON * math.sqrt(np.mean(np.square(apart)))))
-
-
-def _shading(normal: np.ndarray, reading: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the b that b·n = reading has by weighted least squares, the shorter of many where they do not determine it."""
-    root = np.sqrt(weight)
-    return np.asarray(np.linalg.lstsq(normal * root[:, None], reading * root, rcond=1e-6)[0])
 
 
 def _angle(one: np.ndarray, other: np.ndarray) -> float:

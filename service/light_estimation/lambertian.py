@@ -105,6 +105,11 @@ def median_of(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return np.where(count > 0, ordered[np.maximum(count - 1, 0) // 2, np.arange(values.shape[1])], 0.0)
 
 
+def degrees_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the angle between unit normals, [3, ...] each, in degrees."""
+    return np.asarray(np.degrees(np.arccos(np.clip((one * other).sum(axis=0), -1, 1))))
+
+
 class Suspect(NamedTuple):
     """A light that disagrees with the others."""
 

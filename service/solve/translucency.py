@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from kernels.status import ESTIMATED
+from service.light_estimation.lambertian import degrees_between
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.squares import squares
 from stage.capture.point_lights import DistantLights
@@ -109,6 +110,6 @@ def _lost(normal: np.ndarray, estimated: np.ndarray, blur_px: float) -> np.ndarr
     planes = normal.reshape(3, *estimated.shape)
     blurred = np.stack([gaussian_filter(np.where(estimated, plane, 0).astype(np.float32), blur_px) for plane in planes])
     blurred /= np.maximum(np.linalg.norm(blurred, axis=0), 1e-6)
-    turned = np.degrees(np.arccos(np.clip((blurred * planes).sum(axis=0), -1, 1)))
+    turned = degrees_between(blurred, planes)
     nearby = np.sqrt(gaussian_filter(np.where(estimated, turned**2, 0).astype(np.float32), blur_px) / weight)
     return np.where(estimated, nearby, 0).reshape(-1)

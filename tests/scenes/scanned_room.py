@@ -12,7 +12,7 @@ POSTS = ((3.0, -4.0, 0.4), (-3.5, 2.0, 0.3), (1.5, 5.0, 0.5), (-1.0, -6.0, 0.25)
 """Middle x and z, and radius."""
 DURATION_S, SPIN_HZ, POSES_HZ = 40.0, 5.0, 20
 MOUNT, LEVER = Rotation.from_euler("YX", (0.3, 0.1)), np.array([0.1, 0.4, 0.05])
-"""Of the scanner on the platform."""
+"""How the scanner is mounted on the platform: its rotation, and its place in metres."""
 
 
 def distances(origin: np.ndarray, ray: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from kernels.device import to_numpy
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
-from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, median_of
+from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, degrees_between, median_of
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.manifest import FILE_NAME
@@ -190,7 +190,7 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
                             f"{100 * sigma:.0f} % of the depth or more: measure the mean z of the object in the camera frame")
     sigma_m = sigma * depth
     here, off = (surface_at(sample, depth * factor, device).normal for factor in (1.0, 1.0 + sigma))
-    turned = float(np.degrees(np.median(np.arccos(np.clip((here * off).sum(axis=0), -1, 1)))))
+    turned = float(np.median(degrees_between(here, off)))
     z = sample.top - depth
     facts = {"surface_z_m": float(f"{z:.6g}"), "sigma_m": float(f"{sigma_m:.3g}"),
              "sigma_of_normals_degrees": round(turned, 3)}

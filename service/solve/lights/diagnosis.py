@@ -20,7 +20,7 @@ from service.light_estimation.explanations import (
     fit_manifest,
     grey_readings,
 )
-from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
+from service.light_estimation.lambertian import SHADOW, degrees_between, median_of, normal_equations
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.lights.adapted import find_adapted
@@ -151,7 +151,7 @@ def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None
     adapted = find_adapted(sample, np.stack(np.divmod(chosen, given.mask.shape[1]), axis=1))
     if adapted is None:
         return
-    turned = np.degrees(np.arccos(np.clip((solution.normal[:, chosen] * adapted.fit.normal).sum(axis=0), -1, 1)))
+    turned = degrees_between(solution.normal[:, chosen], adapted.fit.normal)
     solution.warnings.append("images: they may be adapted in brightness from place to place, as by HDR or local contrast of a phone, in "
                              f"place of lights of other strengths, which turns normals by {np.median(turned):.2g}°: give images without; "
                              "sigma holds that")
@@ -214,7 +214,7 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
     less = np.bincount(square[:, 0] * SQUARES + square[:, 1], weights=cost - _cost(best.fit))
     if gain < best.least_gain or less.sum() < SURE * np.sqrt((less**2).sum()):
         return None
-    turned = np.degrees(np.arccos(np.clip((far.normal * best.fit.normal).sum(axis=0), -1, 1)))
+    turned = degrees_between(far.normal, best.fit.normal)
     degrees = at_all_pixels(given.mask, np.flatnonzero(given.mask)[chosen][told], turned)
     return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees)
 

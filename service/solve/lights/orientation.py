@@ -15,7 +15,7 @@ from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import Fit, fit_lambertian, median_of
+from service.light_estimation.lambertian import Fit, degrees_between, fit_lambertian, median_of
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.lights.axes import Axes, sites, wrong_axes
 from service.solve.lights.object_outline import EDGE, Outline, cast_shadows, outline
@@ -170,7 +170,7 @@ def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes 
         matrices = (max(matrices, key=lambda matrix: float(np.trace(matrix))),)
     behind = (f"all {len(lights.direction)} lights are behind the object (z ≤ 0), and yet light what the camera sees"
               if (lights.direction[:, 2] <= 0).all() else f"{100 * (1 - fit.facing):.0f} % of the normals face away from the camera")
-    turned = np.degrees(np.arccos(np.clip(((matrices[0] @ fit.normal) * fit.normal).sum(axis=0), -1, 1)))
+    turned = degrees_between(matrices[0] @ fit.normal, fit.normal)
     return LightAxes(f"{behind}: with {_describe(matrices[0])}, {100 * share:.0f} % face it; check the axes (x right, y up, z towards the "
                      "camera)", matrices, float(np.median(turned)))
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from service.light_estimation.lambertian import degrees_between
 from service.solve.base.solution import SolveInput, at_all_pixels
 from service.solve.height.distance import (
     LEAST_LIGHTS,
@@ -163,7 +164,8 @@ def find_placement(given: SolveInput, capture: Capture, lights: PlacedLights) ->
         f"frames[].light.position_m: the near lights look moved by ({words}) m and {factor:.3g} times as far from the origin; the readings "
         f"then cost {100 * gain:.0f} % less: check origin and scale of the positions, camera.surface_z_m, camera.pixel_size_m, and that no "
         "light of the room is in the images; or take them as found (--lights refined)",
-        (float(way[0]), float(way[1]), float(way[2])), factor, gain, search.at_all_pixels(given, _turned(declared, moved)))
+        (float(way[0]), float(way[1]), float(way[2])), factor, gain,
+        search.at_all_pixels(given, degrees_between(declared.normal, moved.normal)))
 
 
 def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> RefinedPlaces:
@@ -179,7 +181,8 @@ def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> 
                                "frames[].light.position_m, their order and axes")
     square = squares_of(search.sample.mask)
     even = (square // SQUARES + square) % 2 == 0  # as on a chessboard
-    left = _turned(*(search.fit(search.best(own)) for own in (even, ~even)))  # twice what noise leaves, for what both halves share
+    # twice what noise leaves, for what both halves share
+    left = degrees_between(*(search.fit(search.best(own)).normal for own in (even, ~even)))
     lamps = search.moved(found)
     ratio = lamps.strength / search.sample.lamps.strength
     if not found.irradiance_holds:  # then as strong at the origin as before, on the whole
@@ -199,8 +202,3 @@ def refine_places(given: SolveInput, capture: Capture, lights: PlacedLights) -> 
         return RefinedPlaces(moved, doubt, {"refined_lights": facts}, ())
     return RefinedPlaces(moved, np.hypot(doubt, np.float32(turn.sigma_degrees)),
                          {"refined_lights": facts, "light_turn": turn.facts()}, (f"frames[].light.position_m: {turn.undone()}",))
-
-
-def _turned(one: NearFit, other: NearFit) -> np.ndarray:
-    """Return the angle between the normals of two fits, [pixels] degrees."""
-    return np.degrees(np.arccos(np.clip((one.normal * other.normal).sum(axis=0), -1, 1)))

@@ -157,16 +157,15 @@ def find_lights(given: SolveInput) -> UnknownLights:
         raise CalibrationError("--lights unknown: the images do not determine the lights: too much of the object is dark, saturated or "
                                "flat; photograph a chrome ball, or give directions") from error
     outward = _outward(given, factors.lights, matrix)
-    if outward < 0:
+    upright: bool | None = outward > 0
+    if abs(outward) < CLEAR:
+        upright = is_upright(given, _lights_of(factors.lights @ np.linalg.inv(matrix)),
+                             lambda pixels: _unit(matrix @ fit_surface(*_read(given, pixels), factors.lights)))
+    two_ways = upright is None
+    if outward < 0 if two_ways else not upright:
         matrix, others = INVERSE @ matrix, [INVERSE @ other for other in others]
-    found = _lights_of(factors.lights @ np.linalg.inv(matrix))
-    upright = None if abs(outward) >= CLEAR else is_upright(
-        given, found, lambda pixels: _unit(matrix @ fit_surface(*_read(given, pixels), factors.lights)))
-    if upright is False:
-        matrix, others = INVERSE @ matrix, [INVERSE @ other for other in others]
-        found = _lights_of(factors.lights @ np.linalg.inv(matrix))
-    two_ways = abs(outward) < CLEAR and upright is None
     back = np.linalg.inv(matrix)
+    found = _lights_of(factors.lights @ back)
     least = HIGHLIGHT_DEGREES / relief.told if relief.by == "highlights" else ALBEDO_DEGREES
     result = UnknownLights(found, tuple(other @ back for other in others), least, two_ways, {}, _warnings(relief, two_ways))
     sigma = float(np.median(result.doubt(_unit(matrix @ b))))
