@@ -12,9 +12,10 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes, map_coordinates
 
 from kernels import device as devices
-from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
+from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv, six_digits
 from service.boards.height_files import BOARD_FILE, Match, Nominal, check_size, match, read_design, read_golden, write_board
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
+from service.boards.shared_deviation import SharedDeviation, shared_deviation
 from service.boards.stitching.form import bow_and_twist, fit_form, fit_spline
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
@@ -67,6 +68,7 @@ class _Judged(NamedTuple):
     nominal: Nominal
     match: Match
     deviation: HeightMap
+    shared: SharedDeviation | None
     bow_m: float
     wanted: np.ndarray  # [rows, cols] bool: pixels with a nominal height, but for a frame that is narrower than a defect
     inspected: np.ndarray  # [rows, cols] bool
@@ -89,7 +91,9 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
         heights, judged = _levelled(blend(board.tiles, stitched, stitched.grid, progress=timings.advance)), None
     else:
         heights, judged = _judge(board, stitched, nominal, request, timings)
-    warnings = [*stitched.warnings, *(judged.match.warnings if judged is not None else ())]
+    warnings = stitched.warnings + ([] if judged is None else judged.match.warnings)
+    if judged is not None and judged.shared is not None:
+        warnings += judged.shared.sentences()
     timings.stage("write", 1)
     contents = {name: digest(path) for name, path in (("golden", None if nominal is None or request.golden is None else nominal.path),
                                                       ("regions", request.regions), ("design", request.design)) if path is not None}
@@ -185,7 +189,8 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     inspected |= wanted & significant & deviation.measured
     regions, k = check_regions(deviation, nominal.regions, false_alarm=request.false_alarm / 2,
                                least_inspected=LEAST_OF_REGIONS if request.least_inspected is None else request.least_inspected)
-    return heights, _Judged(nominal, found, deviation, bow_and_twist(curved, grid), wanted, inspected, scan, defects, regions, k,
+    shared = shared_deviation(deviation, nominal.heights)
+    return heights, _Judged(nominal, found, deviation, shared, bow_and_twist(curved, grid), wanted, inspected, scan, defects, regions, k,
                             _verdict(defects, regions, inspected, wanted, request))
 
 
@@ -259,6 +264,9 @@ def _comparison(judged: _Judged, area_count: int) -> dict[str, Any]:
                          "shift_sigma_m": [float(f"{value:.3g}") for value in found.shift_sigma_m],
                          "correlation": float(f"{found.correlation:.4g}")},
         "bow_and_twist_m": float(f"{judged.bow_m:.4g}"),
+        "shared": None if judged.shared is None else {
+            name: {"value": six_digits(factor.value), "sigma": float(f"{factor.sigma:.3g}")}
+            for name, factor in judged.shared.named().items()},
         "deviation_m": statistics(judged.deviation.height[known]), "sigma_m": statistics(judged.deviation.sigma[known]),
         "windows": {"sides_px": list(scan.sides_px), "tests": scan.tests, "threshold_sigma": float(f"{scan.threshold:.4g}"),
                     "spread": {str(side): float(f"{value:.4g}") for side, value in scan.spread.items()},

@@ -78,23 +78,23 @@ def _filled(height: np.ndarray) -> np.ndarray:
 class Blender:
     """Sums of patches over a grid."""
 
-    def __init__(self, grid: BoardGrid, *, centre: tuple[float, float], length_m: float, noise_factor: float) -> None:
-        """Start with nothing; centre and length are those of the motions, and the noise of patches is larger than they say by a factor."""
-        self.grid, self.centre, self.length_m, self.noise = grid, centre, length_m, noise_factor**2
+    def __init__(self, grid: BoardGrid, *, centre: tuple[float, float], length_m: float) -> None:
+        """Start with nothing; centre and length are those of the motions."""
+        self.grid, self.centre, self.length_m = grid, centre, length_m
         shape = (grid.rows, grid.cols)
         self.weight, self.height, self.square, self.spread, self.systematic = (np.zeros(shape) for _ in range(5))
         self.tiles = np.zeros(shape, dtype=np.uint8)
 
-    def add(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> None:
+    def add(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float, *, noise_factor: float) -> None:
         """Add the patch of one tile.
         `covariance`: [6, 6] m² of the tile's motion, as in Motions. `shared_m`: standard deviation of the error that the pixels of a block
-        share."""
+        share. `noise_factor`: the noise of the patch over what it says."""
         rows = slice(patch.row, patch.row + patch.height.shape[0])
         cols = slice(patch.col, patch.col + patch.height.shape[1])
         there = patch.measured
         if not there.any():
             return
-        variance = np.where(there, patch.variance * self.noise, 1.0)
+        variance = np.where(there, patch.variance * noise_factor**2, 1.0)
         systematic = self._systematic(patch, covariance, shared_m)
         weight = np.where(there, 1 / (variance + systematic**2), 0)
         height = np.where(there, patch.height, 0)

@@ -7,6 +7,7 @@ the camera. Heights are z. A grid is an orthographic camera that looks along -z,
 from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from stage.capture.camera import Camera
 from stage.spread import MAD_TO_SIGMA
@@ -122,14 +123,24 @@ def gradients(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def bends(height: np.ndarray) -> np.ndarray:
-    """Return the larger second difference along rows and columns of a height map, smoothed (1 2 1) across; inf beside missing pixels."""
+    """Return the larger second difference along rows and columns of a height map, smoothed (1 2 1) across, [rows, cols]; a missing
+    neighbour counts as high as the pixel between, so that beside it the first difference is left. NaN where not measured."""
     padded = np.pad(height, 1, constant_values=np.nan)
-    smooth = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
-    across = smooth[:, 2:] - 2 * smooth[:, 1:-1] + smooth[:, :-2]
-    smooth = (padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]) / 4
-    down = smooth[2:] - 2 * smooth[1:-1] + smooth[:-2]
-    larger = np.maximum(np.abs(across), np.abs(down))
-    return np.where(np.isfinite(larger), larger, np.inf)
+    second = []
+    for image in (padded, padded.T):
+        middle = image[:, 1:-1]
+        across = sum(np.where(np.isfinite(other), other - middle, 0) for other in (image[:, :-2], image[:, 2:]))
+        known = np.isfinite(middle)
+        weights = np.stack([known[:-2], 2 * known[1:-1], known[2:]])
+        values = np.stack([np.where(known, across, 0)[k : len(known) - 2 + k] for k in range(3)])
+        second.append((weights * values).sum(axis=0) / np.maximum(weights.sum(axis=0), 1))
+    return np.where(np.isfinite(height), np.maximum(np.abs(second[0]), np.abs(second[1].T)), np.nan)
+
+
+def edge_variance(bend: np.ndarray, noise: float) -> np.ndarray:
+    """Return the variance of what interpolation makes wrong at edges, 0 where there is none, by the second differences of heights (`bends`)
+    and the standard deviation of the noise of a pixel."""
+    return np.where(bend > CLEAR_BEND * BEND_NOISE * noise, (BEND_SHARE * bend) ** 2, 0.0)
 
 
 def shift_error(
@@ -140,16 +151,27 @@ def shift_error(
     """Return σ of the error of heights that an uncertain shift makes, [rows, cols] in the unit of the heights.
 
     Slope times σ, where a slope is clear; of a shift that is uncertain by more than WIDE_PX, half of what heights differ by within 2.5 σ
-    of a pixel, less what noise alone differs by.
+    of a pixel, less what noise alone differs by. Both are taken from the heights and from their means over SMOOTHED pixels too, whose
+    slopes are clear where noise hides those of single pixels.
     """
-    across, down, gain = gradients(height)
-    clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * noise
-    error = np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0)
-    if max(sigma_px) > WIDE_PX:
-        reach = [int(np.ceil(2.5 * sigma)) for sigma in sigma_px]
-        high, low = (_extreme(height, reach, sign) for sign in (1, -1))
-        error = np.maximum(error, np.clip(np.nan_to_num(high + low) - NOISE_SPAN * noise, 0, None) / 2)
-    return np.asarray(error)
+    error = np.zeros(height.shape)
+    for side in (1, *SMOOTHED):
+        means, left = (height, noise) if side == 1 else (local_means(height, side), noise / side)
+        across, down, gain = gradients(means)
+        clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * left
+        error = np.maximum(error, np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0))
+        if max(sigma_px) > WIDE_PX:
+            reach = [int(np.ceil(2.5 * sigma)) for sigma in sigma_px]
+            high, low = (_extreme(means, reach, sign) for sign in (1, -1))
+            error = np.maximum(error, np.clip(np.nan_to_num(high + low) - NOISE_SPAN * left, 0, None) / 2)
+    return error
+
+
+def local_means(height: np.ndarray, side: int) -> np.ndarray:
+    """Return the means of what was measured in the square of a side about each pixel, NaN where the pixel was not, [rows, cols]."""
+    known = np.isfinite(height)
+    total, count = (uniform_filter(values, side, mode="constant") for values in (np.where(known, height, 0), known.astype(np.float64)))
+    return np.where(known, total / np.where(known, count, 1), np.nan)
 
 
 def _extreme(height: np.ndarray, reach: list[int], sign: int) -> np.ndarray:
@@ -168,12 +190,19 @@ def _extreme(height: np.ndarray, reach: list[int], sign: int) -> np.ndarray:
     return np.asarray(out)
 
 
+SMOOTHED = (3, 9)
+"""Sides of the squares, pixels, whose means tell slopes that the noise of pixels hides."""
 WIDE_PX = 0.4
 """A shift that is more uncertain than this is beyond what the slope at a pixel tells."""
 CLEAR_SLOPE = 4.0
 """A slope counts where it is this many times its noise."""
 NOISE_SPAN = 8.0
 """The range of noise within a window of some hundred pixels, in σ."""
+BEND_SHARE = 1 / 3
+"""The error that interpolation makes at an edge, as a part of the second difference there: a step of height h between two pixels is seen
+anywhere from 0 to h, with a standard deviation of h / √12; 1/3 is a little more."""
+CLEAR_BEND = 4.0
+"""A second difference counts where it is this many times its noise."""
 BEND_NOISE = float(np.sqrt(6 * 6 / 16))
 """The factor by which `bends` multiplies the standard deviation of independent noise along either direction."""
 

@@ -12,7 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.stitching.grid import BLOCK_PX, BoardGrid, HeightPatch, blocks_of, gradients, robust_sigma, tukey_weights
+from service.boards.stitching.grid import (
+    BLOCK_PX,
+    BoardGrid,
+    HeightPatch,
+    bends,
+    blocks_of,
+    edge_variance,
+    gradients,
+    robust_sigma,
+    tukey_weights,
+)
 from service.boards.stitching.shift_search import LEAST_PIXELS, SHARED_PX, find_shifts
 
 UNKNOWNS = 6
@@ -31,6 +41,8 @@ CLEAR_DIRECTION = 10.0
 """Information about a shift counts in directions where it is this many times what the noise of slopes alone gives."""
 LEAST_CLEAR = 150
 """The fewest pixels with a clear slope that measure a shift."""
+RANK = 1e-12
+"""Eigenvalues below this part of the largest belong to what is not determined."""
 LEAST_LOG_ODDS = 7.0
 """Log odds (1000 : 1) by which the best shift must be more probable than any other; else the shift counts as not measured."""
 
@@ -204,33 +216,37 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     clear = np.hypot(across, down)[both] > floor
     slope_x, slope_y = np.where(clear, across[both], 0) / grid.pixel_m, np.where(clear, -down[both], 0) / grid.pixel_m
     rows = np.stack([-slope_x, -slope_y, slope_x * y - slope_y * x, np.ones_like(x), x, y])  # [6, n]
-    noise = np.sqrt(variance * (first.noise_share + second.noise_share) / 2)
+    bent = [bends(heights)[both] for heights in (common.first, common.second)]
+    own, stated = variance * (first.noise_share + second.noise_share) / 2, float(np.sqrt(np.median(variance) / 2))
+    noise, edges = np.sqrt(own), np.zeros_like(variance)
     solution, weight = np.zeros(UNKNOWNS), np.ones_like(residual)
     scale = 1.0
     for turn in range(ROUNDS):
         left = residual + solution @ rows
         if turn == 0:
             left = left - np.median(left)
-        normalised = left / noise
-        scale = max(robust_sigma(normalised), 1e-9)
-        weight = tukey_weights(normalised, max(scale, 1.0)) / variance
+        scale = max(robust_sigma(left / noise), 1e-9)
+        edges = np.add(*(edge_variance(bend, stated * max(scale, 1.0)) for bend in bent))
+        noise = np.sqrt(own + edges)
+        weight = tukey_weights(left / noise, max(scale, 1.0)) / (variance + edges)
         normal = (rows * weight) @ rows.T
         if int(clear.sum()) < LEAST_CLEAR:
             normal[LATERAL], normal[:, LATERAL] = 0, 0
         solution = -np.linalg.lstsq(_scaled(normal), (rows * weight) @ residual / _diagonal(normal), rcond=1e-10)[0] / _diagonal(normal)
     left = residual + solution @ rows
     kept = weight > 0
-    scale = robust_sigma(left[kept] / noise[kept])
+    quiet = kept & (edges == 0)
+    scale = robust_sigma((left / noise)[quiet if quiet.sum() >= LEAST_PIXELS / 2 else kept])
     field = np.full(common.first.shape, np.nan)
     field[both] = np.where(kept, left, np.nan)
     shared = _shared(field, float(np.median(variance)) * max(scale, 1.0) ** 2)
-    information = (rows * weight) @ rows.T / max(scale, 1.0) ** 2
-    spurious = float(weight[clear].sum()) * float(gain) ** 2 * float(np.median(variance)) / 4 / grid.pixel_m**2 / max(scale, 1.0) ** 2
-    measured = _directions(information, spurious if int(clear.sum()) >= LEAST_CLEAR else np.inf)
+    normal, widened = (rows * weight) @ rows.T, max(scale, 1.0) ** 2
+    spurious = float(weight[clear].sum()) * float(gain) ** 2 * float(np.median(variance)) / 4 / grid.pixel_m**2
+    measured = _directions(normal, spurious if int(clear.sum()) >= LEAST_CLEAR else np.inf)
     keep = np.eye(UNKNOWNS)
     keep[:2, :2] = measured
     keep[2, 2] = float(measured.any())
-    information = keep @ information @ keep
+    information = keep @ _information(normal, (rows * weight**2 * widened * (variance + SHARED_PX * edges)) @ rows.T) @ keep
     moved = solution.copy()  # the whole shift belongs to the difference: first − second = fitted − the shift of the second
     moved[0] -= shift[1] * grid.pixel_m
     moved[1] += shift[0] * grid.pixel_m
@@ -245,6 +261,13 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     return _Fit(moved, information, residual.size, measured, correlation, all(reliefs),
                 reliefs[0] != reliefs[1] and max(spread) > 2 * SIGNAL * max(noises), scale, shared, robust_sigma(left),
                 float(np.sqrt(np.mean(np.square(np.clip(left / noise, -CAPPED, CAPPED))))))
+
+
+def _information(normal: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Return the inverse of the covariance of a weighted fit, from its normal equations and the covariance of their right side, all
+    [6, 6]: the weights do not say that pixels at edges share their errors."""
+    inverse = np.linalg.pinv(normal, rcond=RANK, hermitian=True)
+    return np.asarray(np.linalg.pinv(inverse @ scores @ inverse, rcond=RANK, hermitian=True))
 
 
 def _directions(information: np.ndarray, spurious: float) -> np.ndarray:

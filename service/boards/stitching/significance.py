@@ -20,7 +20,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import label
 
-from service.boards.stitching.grid import BEND_NOISE, HeightMap, bends, robust_sigma, shift_error
+from service.boards.stitching.grid import HeightMap, bends, edge_variance, robust_sigma, shift_error
 
 CLIP = 6.0
 ENOUGH_WINDOWS = 100
@@ -35,11 +35,6 @@ DOUBLINGS = 5
 """Sizes of windows, each twice the one before."""
 POWER = NormalDist().inv_cdf(0.95)
 """σ above the threshold at which a defect is found with a probability of 95 %."""
-BEND_SHARE = 1 / 3
-"""The error that interpolation makes at an edge, as a part of the second difference there: a step of height h between two pixels is seen
-anywhere from 0 to h, with a standard deviation of h / √12; 1/3 is a little more."""
-CLEAR_BEND = 4.0
-"""A second difference counts where it is this many times its noise."""
 MATCH_PX = 0.05
 """The least standard deviation of the shift between two maps, pixels: optics and sampling differ from map to map."""
 
@@ -252,9 +247,8 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     offset = float(np.median(deviation[known])) if known.any() else 0.0
     whole = np.where(np.isfinite(nominal.height), nominal.height, measured.height - offset)
     seen = np.where(np.isfinite(measured.height), measured.height - offset, whole)
-    bend = np.maximum(*(np.where(np.isfinite(found := bends(heights)), found, 0) for heights in (whole, seen)))
     right, up = (max(sigma / measured.grid.pixel_m, MATCH_PX) for sigma in shift_sigma_m)
-    edges = np.where(bend > CLEAR_BEND * BEND_NOISE * noise, BEND_SHARE * bend, 0) ** 2
+    edges = np.maximum(*(edge_variance(bends(heights), noise) for heights in (whole, seen)))
     edges += shift_error((whole + seen) / 2, (right, up), noise) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
     return HeightMap(measured.grid, deviation, variance, np.where(known, systematic, np.nan))

@@ -26,6 +26,8 @@ noise, and itself does not fit."""
 LEAST_PART = 0.5
 """Overlaps are measured if they have at least this part of the largest overlap of one of their tiles: a corner says little."""
 FAR_SIGMA = 5.0
+NOISIER = 1.3
+"""The factor from which on noise is said to be more than the σ of the depths, or that of other tiles."""
 MILLI = 1000.0
 
 
@@ -71,6 +73,8 @@ class Stitched(NamedTuple):
     overlaps: dict[tuple[int, int], Overlap]
     noise_factor: float
     """Noise over σ of the depths; 1 or more, and 1 for a single tile."""
+    tile_noise: np.ndarray
+    """[tiles] the same for each tile, which is more where all of its overlaps are noisier than others."""
     shared_m: float
     """Standard deviation of the error of a tile that the pixels of a block share, with the heights by which overlaps differ still."""
     warnings: list[str]
@@ -120,18 +124,19 @@ def stitch(
     used = [overlap for overlap in overlaps.values() if overlap.evidence is not Evidence.DIFFERS]
     noise = max(1.0, float(np.median([overlap.noise_factor for overlap in used]))) if used else 1.0
     shared = float(np.sqrt(np.mean([overlap.shared_m**2 for overlap in used]) + motions.misfit_m**2)) if used else 0.0
-    said = [*_warnings(tiles, overlaps, motions, noise), *_far(tiles, motions, middles / length, shift_sigma)]
-    return Stitched(grid, centre, length, motions, overlaps, noise, shared, said)
+    each = _tile_noise(overlaps, len(tiles), noise)
+    said = [*_warnings(tiles, overlaps, motions, noise, each), *_far(tiles, motions, middles / length, shift_sigma)]
+    return Stitched(grid, centre, length, motions, overlaps, noise, each, shared, said)
 
 
 def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
           progress: Callable[[int], None] = lambda done: None) -> HeightMap:
     """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none."""
-    blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m, noise_factor=stitched.noise_factor)
+    blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m)
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
         patch = _patch(tile, stitched.motions.values[number] + whole, grid, stitched.centre, stitched.length_m)
-        blender.add(patch, stitched.motions.of_tile(number), stitched.shared_m)
+        blender.add(patch, stitched.motions.of_tile(number), stitched.shared_m, noise_factor=float(stitched.tile_noise[number]))
         progress(number + 1)
     return blender.result()
 
@@ -234,6 +239,15 @@ def _solve(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap]
     return motions
 
 
+def _tile_noise(overlaps: dict[tuple[int, int], Overlap], count: int, noise: float) -> np.ndarray:
+    """Return the noise of each tile over σ of its depths, [tiles]: the least that its overlaps leave to it beside the least noisy tile,
+    and that of all tiles at the least. An overlap has the mean square of its two tiles' factors."""
+    factors = {pair: max(overlap.noise_factor, 1.0) for pair, overlap in overlaps.items() if overlap.evidence is not Evidence.DIFFERS}
+    quietest = min(factors.values(), default=1.0)
+    own = [min((factor for pair, factor in factors.items() if tile in pair), default=quietest) for tile in range(count)]
+    return np.maximum(noise, np.sqrt(2 * np.square(own) - quietest**2))
+
+
 def _without_shift(overlap: Overlap) -> Overlap:
     information = overlap.information.copy()
     information[:3], information[:, :3] = 0, 0
@@ -248,7 +262,8 @@ def _far(tiles: Sequence[TilePoints], motions: Motions, middles: np.ndarray, shi
             for tile, distance in zip(tiles, away, strict=True) if distance > FAR_SIGMA * shift_sigma_m]
 
 
-def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap], motions: Motions, noise: float) -> list[str]:
+def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap], motions: Motions, noise: float,
+              tile_noise: np.ndarray) -> list[str]:
     found = []
     if len(tiles) == 1:
         return ["there is a single tile: no overlap checks its noise or the errors that its pixels share"]
@@ -264,6 +279,10 @@ def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overl
     if placed:
         found.append(f"{len(placed)} of {len(tiles)} tiles have too little relief in their overlaps to measure a shift "
                      f"({', '.join(placed[:5])}{' …' if len(placed) > 5 else ''}): they lie where the stage says")
-    if noise > 1.3:
+    if noise > NOISIER:
         found.append(f"the noise of the tiles is {noise:.2f} times what the σ of their depths says: every σ is larger by that")
+    noisy = [(tile.name, factor) for tile, factor in zip(tiles, tile_noise, strict=True) if factor > NOISIER * noise]
+    if noisy:
+        found.append("the noise of " + ", ".join(f"tile {name} is {factor:.2f} times" for name, factor in noisy[:5])
+                     + f"{' …' if len(noisy) > 5 else ''} what the σ of its depths says: its σ is larger by that")
     return found
