@@ -159,7 +159,8 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     for tile, own in zip(board.tiles, stitched.motions.values, strict=True):
         x, y, z = tile.moved(own + found.motion, centre=stitched.centre, length_m=stitched.length_m)
         tiles.append(without_hidden_outliers(tile, z - map_coordinates(nominal.heights.height, grid.place(x, y), order=1, cval=np.nan)))
-    heights = blend(tiles, stitched, grid, motion=found.motion, progress=lambda done: timings.advance(len(tiles) + done))
+    heights = blend(tiles, stitched, grid, motion=found.motion, relief=nominal.heights.height,
+                    progress=lambda done: timings.advance(len(tiles) + done))
     timings.stage("judge", 1)
     deviation = compare(heights, nominal.heights, shift_sigma_m=found.shift_sigma_m)
     plane = fit_form(grid, deviation.height, quadratic=False)

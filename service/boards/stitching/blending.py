@@ -78,9 +78,11 @@ def _filled(height: np.ndarray) -> np.ndarray:
 class Blender:
     """Sums of patches over a grid."""
 
-    def __init__(self, grid: BoardGrid, *, centre: tuple[float, float], length_m: float) -> None:
-        """Start with nothing; centre and length are those of the motions."""
-        self.grid, self.centre, self.length_m = grid, centre, length_m
+    def __init__(self, grid: BoardGrid, *, centre: tuple[float, float], length_m: float,
+                 relief: np.ndarray | None = None) -> None:
+        """Start with nothing; centre and length are those of the motions. `relief`: [rows, cols] heights whose slopes tell what a tile that
+        is misplaced has wrong, metres, NaN where not known; None: those of each tile."""
+        self.grid, self.centre, self.length_m, self.relief = grid, centre, length_m, relief
         shape = (grid.rows, grid.cols)
         self.weight, self.height, self.square, self.spread, self.systematic = (np.zeros(shape) for _ in range(5))
         self.tiles = np.zeros(shape, dtype=np.uint8)
@@ -125,5 +127,6 @@ class Blender:
         to_middle = np.array([[1, 0, -basis[..., 2].mean()], [0, 1, basis[..., 1].mean()]])
         shift = np.diag(to_middle @ covariance[:3, :3] @ to_middle.T) / self.grid.pixel_m**2 + LEAST_SHIFT_PX**2
         right, up = (float(value) for value in np.sqrt(shift))
-        slopes = shift_error(patch.height, (right, up), float(np.sqrt(np.nanmedian(patch.variance))))
+        relief = patch.height if self.relief is None else self.relief[row, col]
+        slopes = shift_error(np.where(np.isfinite(relief), relief, patch.height), (right, up), float(np.sqrt(np.nanmedian(patch.variance))))
         return np.asarray(np.sqrt(np.maximum(plane, 0) + shared_m**2 + slopes**2))

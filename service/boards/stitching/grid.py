@@ -156,7 +156,8 @@ def shift_error(
     """
     error = np.zeros(height.shape)
     for side in (1, *SMOOTHED):
-        means, left = (height, noise) if side == 1 else (local_means(height, side), noise / side)
+        means, left = local_means(height, side), noise / side
+        means = np.where(np.abs(means - height) < FLAT * noise, means, np.nan) if side > 1 else height
         across, down, gain = gradients(means)
         clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * left
         error = np.maximum(error, np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0))
@@ -192,6 +193,8 @@ def _extreme(height: np.ndarray, reach: list[int], sign: int) -> np.ndarray:
 
 SMOOTHED = (3, 9)
 """Sides of the squares, pixels, whose means tell slopes that the noise of pixels hides."""
+FLAT = 4.0
+"""Means count where they are within so many σ of the noise of their pixel: they do not smear walls, which are clear without them."""
 WIDE_PX = 0.4
 """A shift that is more uncertain than this is beyond what the slope at a pixel tells."""
 CLEAR_SLOPE = 4.0

@@ -11,6 +11,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from service.boards.stitching.grid import (
     BLOCK_PX,
@@ -216,7 +217,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     clear = np.hypot(across, down)[both] > floor
     slope_x, slope_y = np.where(clear, across[both], 0) / grid.pixel_m, np.where(clear, -down[both], 0) / grid.pixel_m
     rows = np.stack([-slope_x, -slope_y, slope_x * y - slope_y * x, np.ones_like(x), x, y])  # [6, n]
-    bent = [bends(heights)[both] for heights in (common.first, common.second)]
+    bent = [maximum_filter(np.nan_to_num(bends(heights)), 3)[both] for heights in (common.first, common.second)]
     own, stated = variance * (first.noise_share + second.noise_share) / 2, float(np.sqrt(np.median(variance) / 2))
     noise, edges = np.sqrt(own), np.zeros_like(variance)
     solution, weight = np.zeros(UNKNOWNS), np.ones_like(residual)
@@ -246,7 +247,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     keep = np.eye(UNKNOWNS)
     keep[:2, :2] = measured
     keep[2, 2] = float(measured.any())
-    information = keep @ _information(normal, (rows * weight**2 * widened * (variance + SHARED_PX * edges)) @ rows.T) @ keep
+    information = keep @ (normal / widened) @ keep
     moved = solution.copy()  # the whole shift belongs to the difference: first − second = fitted − the shift of the second
     moved[0] -= shift[1] * grid.pixel_m
     moved[1] += shift[0] * grid.pixel_m
@@ -260,14 +261,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     reliefs = [value > SIGNAL * noise for value, noise in zip(spread, noises, strict=True)]
     return _Fit(moved, information, residual.size, measured, correlation, all(reliefs),
                 reliefs[0] != reliefs[1] and max(spread) > 2 * SIGNAL * max(noises), scale, shared, robust_sigma(left),
-                float(np.sqrt(np.mean(np.square(np.clip(left / noise, -CAPPED, CAPPED))))))
-
-
-def _information(normal: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return the inverse of the covariance of a weighted fit, from its normal equations and the covariance of their right side, all
-    [6, 6]: the weights do not say that pixels at edges share their errors."""
-    inverse = np.linalg.pinv(normal, rcond=RANK, hermitian=True)
-    return np.asarray(np.linalg.pinv(inverse @ scores @ inverse, rcond=RANK, hermitian=True))
+                float(np.sqrt(np.mean(np.square(np.clip(left / np.sqrt(own), -CAPPED, CAPPED))))))
 
 
 def _directions(information: np.ndarray, spurious: float) -> np.ndarray:

@@ -130,9 +130,9 @@ def stitch(
 
 
 def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
-          progress: Callable[[int], None] = lambda done: None) -> HeightMap:
-    """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none."""
-    blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m)
+          relief: np.ndarray | None = None, progress: Callable[[int], None] = lambda done: None) -> HeightMap:
+    """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none. `relief`: as in Blender."""
+    blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m, relief=relief)
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
         patch = _patch(tile, stitched.motions.values[number] + whole, grid, stitched.centre, stitched.length_m)
