@@ -59,9 +59,11 @@ def lay(heights: HeightMap, openings: np.ndarray, *, stencil_m: float, search_px
     found = _correlation(paste, heights.measured, openings, search_px)
     best = float(found.max())
     if best < LEAST_CORRELATION:
-        mirrored = float(_correlation(paste, heights.measured, openings[:, ::-1], search_px).max())
+        mirrored, turned = (float(_correlation(paste, heights.measured, other, search_px).max())
+                            for other in (openings[:, ::-1], openings[::-1, ::-1]))
         raise BoardError(f"the paste on the board does not lie as the openings do (correlation {best:.2f}), " + (
             f"and does if they are mirrored ({mirrored:.2f}): it is the other --side" if mirrored >= LEAST_CORRELATION else
+            f"and does if they are turned by 180° ({turned:.2f}): turn the board in its fixture" if turned >= LEAST_CORRELATION else
             "within the error of its place: give --origin-m, or a larger --placement-m"))
     down, right = np.mgrid[-search_px : search_px + 1, -search_px : search_px + 1]
     row, col = (at.ravel()[found.argmax()] for at in (down, right))

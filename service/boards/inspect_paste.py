@@ -16,6 +16,7 @@ from service.boards.height_files import BOARD_FILE, write_board
 from service.boards.inspect_board import stitch_board, stitching_entries
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
 from service.boards.paste import Measured, PadPaste, Paste, measure_paste, openings_of
+from service.boards.shared_print import shared_sentences
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
@@ -97,6 +98,7 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
     verdict = _worst(results) if limits else None
     if not found.asked:
         warnings.append("offsets count from where most of the paste lies: an offset of the whole print is not seen without --marks")
+    warnings += _shared(results, heights.grid.pixel_m)
     if unlimited := sum(result.verdict is None for result in results) if limits else 0:
         warnings.append(f"{unlimited} pads are measured and not judged: no limits of {request.limits} fit their names")
     timings.stage("write", 1)
@@ -121,6 +123,14 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
                "shift_sigma_m": [six_digits(value) for value in np.sqrt(np.diag(datum.covariance)[:2])]},
         pads=[{**row, "limits": result.limits} for row, result in zip(rows, results, strict=True)], timings_s=timings.close()))
     return InspectPasteResult(request.out / BOARD_FILE, report_path, picture_path, pads_path, verdict, results, datum, tuple(warnings))
+
+
+def _shared(results: list[PadResult], pixel_m: float) -> list[str]:
+    there = [(result.values, result.pad, result.paste.offset_m) for result in results
+             if result.paste is not None and np.isfinite(result.paste.offset_m).all()]
+    volume, area = (np.array([values[name].value for values, _, _ in there]) for name in ("volume_percent", "area_percent"))
+    return shared_sentences(volume, area, np.array([pad.centre_m for _, pad, _ in there]), np.array([off for _, _, off in there]),
+                            pixel_m=pixel_m)
 
 
 def _components(request: InspectPasteRequest, pads: list[Pad]) -> list[Any]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from service.boards.board_capability import capability
 from service.boards.datum import find_mark, fit_datum, lay
 from service.boards.paste import measure_paste
+from service.boards.shared_print import shared_sentences
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from stage.errors import BoardError
 from stage.formats.gerber import read_pads
@@ -174,6 +176,33 @@ def test_paste_that_fits_its_openings_at_several_places_is_refused():
     assert lay(seen, openings, stencil_m=1e-4, search_px=8, apart_px=5) == pytest.approx([3e-5, 2e-5])
     with pytest.raises(BoardError, match=r"differ by 0\.00018 m fit its openings alike"):
         lay(seen, openings, stencil_m=1e-4, search_px=22, apart_px=5)
+
+
+def test_a_board_that_lies_turned_or_mirrored_is_refused_by_name():
+    grid, height = BoardGrid(1e-5, 0.0, 0.0, 60, 80), np.zeros((60, 80))
+    height[8:20, 10:30] = height[35:50, 12:20] = height[10:24, 50:60] = 1e-4
+    for seen, words in ((height[::-1, ::-1], "turned by 180°"), (height[:, ::-1], "mirrored")):
+        board = HeightMap(grid, seen, np.full(seen.shape, 1e-12), np.zeros(seen.shape))
+        with pytest.raises(BoardError, match=words):
+            lay(board, height > 0, stencil_m=1e-4, search_px=8, apart_px=5)
+
+
+@pytest.mark.parametrize(("volume", "area", "scale", "told", "words"), [
+    (1.0, 1.0, 1.0, None, ""), (0.93, 0.97, 1.0, None, ""), (1.25, 1.03, 1.0, 125, "of the volume"), (1.5, 1.14, 1.0, 150, "of the volume"),
+    (0.64, 0.62, 1.0, 62, "of the area"), (1.0, 1.0, 1.006, 1.006, "times as far apart")])
+def test_what_all_pads_share_is_said(volume, area, scale, told, words):
+    """Twelve pads of which each differs by 3 % and lies 3 µm off, on a board 4 mm wide with pixels of 12 µm: the median of the first is
+    known to 1 %, the scale to .0005; both are within three times that."""
+    rng = np.random.default_rng(8)
+    places = rng.uniform(-2e-3, 2e-3, (12, 2))
+    each = 100 * (1 + 0.03 * rng.standard_normal(12))
+    offsets = (scale - 1) * places + 3e-6 * rng.standard_normal((12, 2)) + [2e-5, -1e-5]
+    said = shared_sentences(volume * each, area * each, places, offsets, pixel_m=1.2e-5)
+    assert len(said) == (told is not None) and all(words in sentence for sentence in said), said
+    if told is not None:
+        number = float(re.search(r"[0-9.]+", said[0])[0])
+        assert number == pytest.approx(told, abs=0.0015 if scale > 1 else 0.03 * told)
+    assert shared_sentences(volume * each[:5], area * each[:5], places[:5], offsets[:5], pixel_m=1.2e-5) == []
 
 
 def test_a_mark_is_found_to_a_part_of_a_pixel_and_a_datum_leaves_out_one_that_is_off():
