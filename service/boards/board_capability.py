@@ -7,11 +7,12 @@ in common speech); the lower bound of Cpk by Bissell, "How reliable is your capa
 import json
 from pathlib import Path
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from service.boards.findings import rounded, table_text
+from service.boards.study_checks import check_runs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import BoardCapabilityRequest
@@ -60,6 +61,8 @@ class BoardCapabilityResult(NamedTuple):
     """The least capable first."""
     left_out: tuple[str, ...]
     """What fewer than LEAST_BOARDS boards have, or what does not vary."""
+    warnings: tuple[str, ...]
+    """A sentence for each thing that the runs contradict."""
 
 
 def board_capability(request: BoardCapabilityRequest, progress: Progress | None = None) -> BoardCapabilityResult:
@@ -69,9 +72,13 @@ def board_capability(request: BoardCapabilityRequest, progress: Progress | None 
     timings.stage("read", len(runs.runs))
     values: dict[Value, dict[str, list[float]]] = {}
     limits: dict[Value, Limits] = {}
+    each_run, inputs_of = [], []
     for number, run in enumerate(runs.runs, start=1):
         path = request.study.parent / run.result / REPORT_FILE
-        for key, (value, own) in _values(path).items():
+        measured, given = _values(path)
+        each_run.append({key: value for key, (value, _) in measured.items()})
+        inputs_of.append(given)
+        for key, (value, own) in measured.items():
             if limits.setdefault(key, own) != own:
                 raise BoardError(f"{path}: {' '.join(key)} has the limits {list(own)}, and {list(limits[key])} in another run: inspect all "
                                  "boards with the same limits")
@@ -79,6 +86,7 @@ def board_capability(request: BoardCapabilityRequest, progress: Progress | None 
             if value is not None:
                 boards.setdefault(run.board, []).append(value)
         timings.advance(number)
+    warnings = check_runs(request.study, runs.runs, each_run, inputs_of)
     found, left_out = [], []
     for key, boards in values.items():
         means = np.array([np.mean(each) for each in boards.values()])
@@ -94,9 +102,9 @@ def board_capability(request: BoardCapabilityRequest, progress: Progress | None 
     write_text(table_path, table_text(Capability._fields, rows))
     write_text(report_path, report(
         request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
-        boards=len({run.board for run in runs.runs}), left_out=left_out, capability=rows,
+        boards=len({run.board for run in runs.runs}), left_out=left_out, capability=rows, warnings=warnings,
         timings_s=timings.close()))
-    return BoardCapabilityResult(table_path, report_path, found, tuple(left_out))
+    return BoardCapabilityResult(table_path, report_path, found, tuple(left_out), tuple(warnings))
 
 
 def capability(key: Value, values: np.ndarray, limits: Limits) -> Capability:
@@ -107,13 +115,15 @@ def capability(key: Value, values: np.ndarray, limits: Limits) -> Capability:
     return Capability(*key, low, high, count, mean, sigma, (high - low) / (6 * sigma), cpk, bound)
 
 
-def _values(path: Path) -> dict[Value, tuple[float | None, Limits]]:
-    """Return what an inspection measured that has limits, and the limits."""
+def _values(path: Path) -> tuple[dict[Value, tuple[float | None, Limits]], dict[str, Any]]:
+    """Return what an inspection measured that has limits, with the limits, and what its report was made of."""
     try:
         content = json.loads(inputs.read_bytes(path))
+        given = content.get("inputs", {})
         if "pads" in content:
-            return {(pad["name"], name): (pad[name], (low, high)) for pad in content["pads"] for name, (low, high) in pad["limits"].items()}
+            return {(pad["name"], name): (pad[name], (low, high)) for pad in content["pads"]
+                    for name, (low, high) in pad["limits"].items()}, given
         return {(region["name"], "deviation_m"): (region["deviation_m"], (region["tolerance_m"][0], region["tolerance_m"][1]))
-                for region in content["regions"]}
+                for region in content["regions"]}, given
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise ManifestError(f"{path}: is no report of relit inspect-paste, or of relit inspect-board with regions") from error

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc
+from scipy.stats import chi2
 
 from service.boards.findings import six_digits, table_text
+from service.boards.study_checks import check_runs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import GaugeBoardRequest
@@ -31,6 +33,8 @@ POOL_PROBABILITY = 0.25
 """The interaction of parts and operators is pooled with the repeatability where chance alone makes it as large this often or more."""
 SPREAD = 6.0
 """Standard deviations that a tolerance is compared with."""
+NOISIER, CHANCE = 1.5, 0.001
+"""The repeatability is said to be more than the inspections state where it is so many times that, and chance explains it this seldom."""
 CATEGORIES = 1.41
 """√2, as AIAG rounds it: the number of distinct categories is this times part over gauge variation."""
 
@@ -51,6 +55,11 @@ class GaugeStudy(NamedTuple):
     total: float
     degrees_of_freedom: int
     """Degrees of freedom from which the repeatability is known."""
+
+    @property
+    def repeatability_bound(self) -> float:
+        """Return what the repeatability is below with a probability of 95 %, by the χ² distribution of its square."""
+        return self.repeatability * math.sqrt(self.degrees_of_freedom / float(chi2.ppf(0.05, self.degrees_of_freedom)))
 
     @property
     def gauge_percent(self) -> float:
@@ -78,6 +87,8 @@ class GaugeBoardResult(NamedTuple):
     parts: int
     left_out: tuple[str, ...]
     """Regions of boards that not every run measured."""
+    warnings: tuple[str, ...]
+    """A sentence for each thing that the runs contradict."""
     noise_m: float
     """Root mean square of the σ that the inspections state: what the repeatability should be if only noise and placing matter."""
 
@@ -101,9 +112,14 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
     runs = read_record(request.study, GaugeRuns)
     timings.stage("read", len(runs.runs))
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    values, inputs_of = [], []
     for number, run in enumerate(runs.runs, start=1):
-        found.setdefault((run.board, run.operator), []).append(_regions(request.study.parent / run.result / REPORT_FILE))
+        regions, given = _regions(request.study.parent / run.result / REPORT_FILE)
+        found.setdefault((run.board, run.operator), []).append(regions)
+        values.append({name: region.get("deviation_m") for name, region in regions.items()})
+        inputs_of.append(given)
         timings.advance(number)
+    warnings = check_runs(request.study, runs.runs, values, inputs_of)
     parts, left_out = _parts(request.study, found)
     try:
         study = gauge_study(np.array([part.values for part in parts]))
@@ -112,6 +128,10 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
     width = min(part.width_m for part in parts)
     noise = float(np.sqrt(np.mean([np.square(part.sigmas).mean() for part in parts])))
     percent = study.tolerance_percent(width)
+    freedom = study.degrees_of_freedom
+    if study.repeatability > NOISIER * noise > 0 and chi2.sf(freedom * (study.repeatability / noise) ** 2, freedom) < CHANCE:
+        warnings.append(f"inspections of a board differ by {study.repeatability / noise:.2g} times the σ that they state: boards that are "
+                        "named wrongly, that were moved or changed between runs, or a σ that is too small")
     timings.stage("write", 1)
     table_path, report_path = request.out / GAUGE_FILE, request.out / REPORT_FILE
     write_text(table_path, _table(parts))
@@ -120,18 +140,19 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
         study={"parts": len(parts), "operators": len({operator for _, operator in found}), "trials": parts[0].values.shape[1],
                **{f"{name}_m": None if value is None else six_digits(value) for name, value in study._asdict().items()
                   if name != "degrees_of_freedom"},
-               "degrees_of_freedom": study.degrees_of_freedom, "gauge_percent": float(f"{study.gauge_percent:.4g}"),
+               "repeatability_bound_m": six_digits(study.repeatability_bound), "degrees_of_freedom": study.degrees_of_freedom,
+               "gauge_percent": float(f"{study.gauge_percent:.4g}"),
                "tolerance_percent": float(f"{percent:.4g}"), "narrowest_tolerance_m": width, "distinct_categories": study.categories,
                "stated_sigma_m": float(f"{noise:.4g}"), "left_out": left_out},
-        timings_s=timings.close()))
-    return GaugeBoardResult(table_path, report_path, study, percent, len(parts), tuple(left_out), noise)
+        warnings=warnings, timings_s=timings.close()))
+    return GaugeBoardResult(table_path, report_path, study, percent, len(parts), tuple(left_out), tuple(warnings), noise)
 
 
-def _regions(path: Path) -> dict[str, Any]:
-    """Return the regions of an inspection's report by name."""
+def _regions(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the regions of an inspection's report by name, and what it was made of."""
     try:
         content = json.loads(inputs.read_bytes(path))
-        return {region["name"]: region for region in content["regions"]}
+        return {region["name"]: region for region in content["regions"]}, content.get("inputs", {})
     except (ValueError, KeyError, TypeError) as error:
         raise ManifestError(f"{path}: is no report of relit inspect-board with a design") from error
 

@@ -78,16 +78,18 @@ def _board_capability(result: "BoardCapabilityResult") -> None:
               f"Cp {each.cp:.2f}, {each.boards} boards")
     if result.left_out:
         print(f"left out {len(result.left_out)} that too few boards have or that do not vary: {', '.join(result.left_out[:5])}")
+    print_warnings(result.warnings)
 
 
 def _gauge_board(result: "GaugeBoardResult") -> None:
     study = result.study
     print(f"table    {result.table_path}")
     print(f"report   {result.report_path}")
-    print(f"repeat   {1e6 * study.repeatability:.4g} µm, {study.degrees_of_freedom} degrees of freedom; the inspections state "
-          f"{1e6 * result.noise_m:.4g} µm")
+    print(f"repeat   {1e6 * study.repeatability:.4g} µm (95 % sure: below {1e6 * study.repeatability_bound:.4g}), "
+          f"{study.degrees_of_freedom} degrees of freedom; the inspections state {1e6 * result.noise_m:.4g} µm")
     print("operator not measured: there is one" if study.reproducibility is None else f"operator {1e6 * study.reproducibility:.4g} µm")
     print(f"gauge    {1e6 * study.gauge:.4g} µm: {study.gauge_percent:.3g} % of the variation of {result.parts} parts, "
           f"{result.tolerance_percent:.3g} % of the narrowest tolerance (6 σ)")
     if result.left_out:
         print(f"left out {len(result.left_out)} regions that not every run measured: {', '.join(result.left_out[:5])}")
+    print_warnings(result.warnings)

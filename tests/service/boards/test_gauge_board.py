@@ -126,3 +126,34 @@ def test_one_operator_tells_the_repeatability_alone():
 def test_too_little_is_refused():
     with pytest.raises(ValueError, match="there are 1 parts and 3 trials: two or more of each are"):
         gauge_study(AIAG[:1])
+
+
+def test_a_measurement_that_is_counted_twice_is_refused(relit, tmp_path):
+    """A copy of a run repeats to all digits, which no gauge does."""
+    study = write_study(tmp_path)
+    (tmp_path / "run_0_0_1" / "report.json").write_bytes((tmp_path / "run_0_0_0" / "report.json").read_bytes())
+    said = relit.refused("gauge-board", study, "--out", tmp_path / "out")
+    assert "run_0_0_1 has the same values as run_0_0_0" in said and not (tmp_path / "out").exists()
+
+
+def test_boards_that_are_exchanged_are_named_and_repeat_worse_than_stated(relit, tmp_path):
+    study = write_study(tmp_path)
+    right = relit("gauge-board", study, "--out", tmp_path / "right")
+    assert right.code == 0 and "is named" not in right.out and "times the σ that they state" not in right.out
+    report = json.loads((tmp_path / "right" / "report.json").read_text())
+    assert report["warnings"] == [] and report["study"]["repeatability_bound_m"] == pytest.approx(
+        report["study"]["repeatability_m"] * np.sqrt(270 / 233.0), rel=0.01)  # χ² of 270 degrees of freedom has its 5 % point at 233
+    change(study, lambda data: [run.update(board=other) for run, other in ((data["runs"][0], "board 3"), (data["runs"][36], "board 0"))])
+    assert relit("gauge-board", study, "--out", tmp_path / "wrong").code == 0
+    said = json.loads((tmp_path / "wrong" / "report.json").read_text())["warnings"]
+    assert [words.split(":")[1].split(" and")[0].strip() for words in said[:2]] == ["run_0_0_0 is named board 3", "run_3_0_0 is named board 0"]
+    assert "measures as board 0" in said[0] and "measures as board 3" in said[1] and "times the σ" in said[2]
+
+
+def test_runs_against_different_golden_boards_are_said(relit, tmp_path):
+    study = write_study(tmp_path)
+    for name, golden in (("run_0_0_0", "a"), ("run_1_0_0", "b")):
+        path = tmp_path / name / "report.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "inputs": {"golden": golden}}))
+    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
+    assert outcome.code == 0 and "another one of the golden boards" in outcome.out + outcome.err
