@@ -249,6 +249,6 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     seen = np.where(np.isfinite(measured.height), measured.height - offset, whole)
     right, up = (max(sigma / measured.grid.pixel_m, MATCH_PX) for sigma in shift_sigma_m)
     edges = np.maximum(*(edge_variance(bends(heights), noise) for heights in (whole, seen)))
-    edges += shift_error((whole + seen) / 2, (right, up), noise) ** 2
+    edges += shift_error(whole, (right, up), noise) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
     return HeightMap(measured.grid, deviation, variance, np.where(known, systematic, np.nan))

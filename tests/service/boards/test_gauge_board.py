@@ -146,7 +146,7 @@ def test_boards_that_are_exchanged_are_named_and_repeat_worse_than_stated(relit,
     change(study, lambda data: [run.update(board=other) for run, other in ((data["runs"][0], "board 3"), (data["runs"][36], "board 0"))])
     assert relit("gauge-board", study, "--out", tmp_path / "wrong").code == 0
     said = json.loads((tmp_path / "wrong" / "report.json").read_text())["warnings"]
-    assert [words.split(":")[1].split(" and")[0].strip() for words in said[:2]] == ["run_0_0_0 is named board 3", "run_3_0_0 is named board 0"]
+    assert "run_0_0_0 is named board 3" in said[0] and "run_3_0_0 is named board 0" in said[1] and len(said) == 3
     assert "measures as board 0" in said[0] and "measures as board 3" in said[1] and "times the σ" in said[2]
 
 
