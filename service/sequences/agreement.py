@@ -12,6 +12,7 @@ motion is alike at neighbouring pixels.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 MEDIANS = {1: 0.4549, 2: 0.6931, 3: 0.7887}
 """Median of χ² over its degrees of freedom, by these."""
@@ -21,6 +22,10 @@ RADII = (1, 3, 7)
 """Radii in pixels of the squares over which differences are averaged."""
 LEAST_AROUND = 0.5
 """Least part of the pixels in the second square that agree by themselves."""
+MEMORY, RECENT = 16, 4
+"""A step has at least these parts, one over each, of the mean and of that of the last steps."""
+CHANCE = 4.0
+"""The square of a lag counts beyond this many times its variance by noise, which of nine squares around a pixel the largest may have."""
 LEAST_PIXELS = 64
 """Least number of pixels from which a share of noise is measured."""
 BINS = 4
@@ -92,11 +97,14 @@ class Track:
     noise: np.ndarray  # [rows, cols] float32, variance of the mean by noise
     constant: np.ndarray  # [rows, cols] float32, standard deviation that all steps share
     count: np.ndarray  # [rows, cols] int32, steps that are joined; 0 where there is no estimate
+    recent: np.ndarray  # [rows, cols, k] float32, the mean in which a step has half of its weight after three
+    recent_noise: np.ndarray  # [rows, cols] float32, its variance by noise
+    lag: np.ndarray  # [rows, cols] float32, square of what the mean lags behind the last step, or the mean of the last ones, beyond noise
 
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviation of the mean, [rows, cols] float32."""
-        return np.sqrt(self.noise + self.constant**2)
+        return np.sqrt(self.noise + self.constant**2 + self.lag)
 
 
 def begin(
@@ -108,22 +116,41 @@ def begin(
     """Return the track of the estimates of one step."""
     noise = np.where(valid, share * sigma**2, 0).astype(np.float32)
     constant = np.where(valid, np.sqrt(np.maximum(1 - share, 0)) * sigma, 0).astype(np.float32)
-    return Track(np.where(valid[..., None], values, 0).astype(np.float32), noise, constant, valid.astype(np.int32))
+    mean = np.where(valid[..., None], values, 0).astype(np.float32)
+    return Track(mean, noise, constant, valid.astype(np.int32), mean, noise, np.zeros_like(noise))
 
 
 def advance(track: Track, new: Track, joined: np.ndarray, *, unit: bool = False) -> Track:
     """Return the track after a further step.
     `new`: of the step alone, of `begin`. `joined`: [rows, cols] bool, where both agree; elsewhere the step stands alone. `unit`: whether
     means are directions."""
-    gain = np.where(joined, track.noise / np.maximum(track.noise + new.noise, 1e-30), 1).astype(np.float32)
+    gain = np.where(joined, np.maximum(track.noise / np.maximum(track.noise + new.noise, 1e-30), 1 / MEMORY), 1).astype(np.float32)
     equal = joined & (track.noise + new.noise == 0)
     gain = np.where(equal, 1 / (track.count + 1), gain).astype(np.float32)
-    mean = track.mean + gain[..., None] * (new.mean - track.mean)
+    quick = np.maximum(gain, np.float32(1 / RECENT))
+    mean, recent = (before + weight[..., None] * (new.mean - before) for before, weight in ((track.mean, gain), (track.recent, quick)))
     if unit:
-        length = np.linalg.norm(mean, axis=-1, keepdims=True)
-        mean = np.where(length > 0, mean / np.maximum(length, 1e-20), 0)
-    mean = np.where(joined[..., None], mean, new.mean)
-    noise = np.where(joined, gain * new.noise, new.noise)
-    constant = np.where(joined, track.constant + gain * (new.constant - track.constant), new.constant)
-    return Track(mean.astype(np.float32), noise.astype(np.float32), constant.astype(np.float32),
-                 np.where(joined, track.count + 1, new.count).astype(np.int32))
+        mean, recent = (values / np.maximum(np.linalg.norm(values, axis=-1, keepdims=True), 1e-20) for values in (mean, recent))
+    mean, recent = (np.where(joined[..., None], values, new.mean).astype(np.float32) for values in (mean, recent))
+    noise, recent_noise = (np.where(joined, (1 - weight) ** 2 * before + weight**2 * new.noise, new.noise).astype(np.float32)
+                           for before, weight in ((track.noise, gain), (track.recent_noise, quick)))
+    constant = np.where(joined, track.constant + gain * (new.constant - track.constant), new.constant).astype(np.float32)
+    lag = np.maximum((1 - gain) ** 2 * _beyond(new.mean - track.mean, new.noise + track.noise, joined),
+                     _beyond(recent - mean, np.maximum(recent_noise - noise, 0), joined)).astype(np.float32)
+    return Track(mean, noise, constant, np.where(joined, track.count + 1, new.count).astype(np.int32), recent, recent_noise, lag)
+
+
+def _beyond(difference: np.ndarray, variance: np.ndarray, joined: np.ndarray) -> np.ndarray:
+    """Return the largest square of the mean of a difference, [rows, cols, k], over 3 × 3 pixels that hold a pixel, beyond what noise makes,
+    [rows, cols]; 0 where nothing is joined."""
+    pixels = np.maximum(_window(joined, 1), 1)
+    square = sum((_window(np.where(joined, difference[..., k], 0), 1) / pixels) ** 2 for k in range(difference.shape[-1]))
+    noise = _window(np.where(joined, variance, 0), 1) / pixels**2
+    return np.where(joined, maximum_filter(np.maximum(square - CHANCE * noise, 0), 3), 0)
+
+
+def steady(track: Track, new: Track, joined: np.ndarray, freedom: int, *, unit: bool = False) -> np.ndarray:
+    """Return where the mean after a further step does not lag behind the last steps, as it does behind what moves slowly, [rows, cols]
+    bool; arguments are those of `advance`, with the freedom of `noise_share`."""
+    after = advance(track, new, joined, unit=unit)
+    return agree(after.recent - after.mean, np.maximum(after.recent_noise - after.noise, 0), joined, freedom)

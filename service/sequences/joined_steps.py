@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from service.sequences.agreement import Track, advance, agree, begin, noise_share
+from service.sequences.agreement import Track, advance, agree, begin, noise_share, steady
 from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
@@ -57,12 +57,14 @@ class MapsJoiner:
             self._begin(before, np.radians(before.sigma.astype(np.float32)), share)
         new = begin(alone.normal, sigma, share, alone.mask)
         rest = agree(new.mean - self._normal.mean, new.noise + self._normal.noise, both, 2)
+        rest &= steady(self._normal, new, rest, 2, unit=True)
         gain = self._gain_of(alone, rest)
         albedo, shares = self._albedo_of(alone, before, both, new.noise, gain)
         if albedo is not None and self._albedo is not None:
             for channel in range(3):  # what a light does to all channels is in the noise of each
                 apart = (albedo.mean - self._albedo.mean)[..., channel : channel + 1]
                 rest = agree(apart, (albedo.noise + self._albedo.noise) / 3, both & rest, 1)
+            rest &= steady(self._albedo, albedo, rest, 3)
             self._albedo = advance(self._albedo, albedo, rest)
         self._normal = advance(self._normal, new, rest, unit=True)
         changed: dict[str, Any] = {"normal": self._normal.mean, "sigma": np.degrees(self._normal.sigma)}
@@ -197,6 +199,7 @@ class DepthJoiner:
             self._track = begin(before.depth[..., None], earlier, share, before.mask & (earlier > 0))
         new = begin(values, sigma, share, valid)
         rest = agree(new.mean - self._track.mean, new.noise + self._track.noise, both, 1)
+        rest &= steady(self._track, new, rest, 1)
         self._track, self._before = advance(self._track, new, rest), alone
         depth = np.where(rest, self._track.mean[..., 0], alone.depth).astype(np.float32)
         ratio = np.where(rest, depth / np.where(alone.depth != 0, alone.depth, 1), 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.sequences.agreement import advance, agree, begin, noise_share
+from service.sequences.agreement import advance, agree, begin, noise_share, steady
 
 SIDE = 96
 ALL = np.ones((SIDE, SIDE), bool)
@@ -38,7 +38,8 @@ def followed(speed: float, *, declared: float = SIGMA, steps: int = 12) -> list[
             if step == 1:
                 track = begin(before, sigma, share, ALL)
             new = begin(raw, sigma, share, ALL)
-            track = advance(track, new, agree(raw - track.mean, track.noise + new.noise, ALL, 2), unit=True)
+            rest = agree(raw - track.mean, track.noise + new.noise, ALL, 2)
+            track = advance(track, new, rest & steady(track, new, rest, 2, unit=True), unit=True)
             mean, alone = (np.sqrt(((each - truth) ** 2).sum(axis=-1).mean()) for each in (track.mean, raw))
             found.append((mean, alone, np.sqrt((track.sigma**2).mean())))
         before = raw
@@ -59,6 +60,29 @@ def test_no_motion_makes_the_mean_worse_than_a_step_alone(speed, declared):
     """From motion of a hundredth of σ a step to one of many; half a per cent is left to pixels that agree by chance."""
     for mean, alone, _ in followed(speed, declared=declared * SIGMA):
         assert mean < 1.005 * alone
+
+
+@pytest.mark.parametrize(("side", "speed", "before", "bound"), [(3, 0.1, 0.28, 0.08), (5, 0.3, 0.15, 0.05), (9, 1.0, 0.03, 0.015)])
+def test_sigma_holds_by_how_much_the_mean_of_a_small_thing_that_moves_slowly_lags(side, speed, before, bound):
+    """A square of some pixels that moves by a part of σ a step, for 40 steps: pixels beyond five σ. `before`: their share without the mean
+    of the last steps; the bounds are twice and more what is left of it (.028, .016, .005)."""
+    random, beyond, at_rest = np.random.default_rng(0), [], []
+    moves = np.zeros(ALL.shape, bool)
+    moves[48 - side // 2 : 49 + side // 2, 48 - side // 2 : 49 + side // 2] = True
+    track = None
+    for step in range(40):
+        truth = np.where(moves, speed * step, 0.0)[..., None]
+        new = begin(truth + random.normal(size=truth.shape), np.ones(ALL.shape), np.ones(ALL.shape), ALL)
+        if track is not None:
+            rest = agree(new.mean - track.mean, track.noise + new.noise, ALL, 1)
+            track = advance(track, new, rest & steady(track, new, rest, 1))
+            over = np.abs(track.mean - truth)[..., 0] / track.sigma
+            beyond.append(np.mean(over[moves] > 5))
+            at_rest.append(np.median(over[~moves]))
+        else:
+            track = new
+    assert np.mean(beyond) < bound < before
+    assert np.mean(at_rest) == pytest.approx(0.67, abs=0.1)  # the median of the magnitude of normal errors
 
 
 def test_the_share_of_noise_is_measured_though_everything_moves():
