@@ -48,26 +48,22 @@ def check_runs(study: Path, runs: Sequence[GaugeRun], values: Sequence[Values], 
 def _misnamed(runs: Sequence[GaugeRun], values: Sequence[Values]) -> list[str]:
     keys = [key for key in dict.fromkeys(key for each in values for key in each) if all(each.get(key) is not None for each in values)]
     boards = list(dict.fromkeys(run.board for run in runs))
-    if len(keys) < LEAST_VALUES or len(boards) < 2:
+    named = np.array([boards.index(run.board) for run in runs])
+    if len(keys) < LEAST_VALUES or len(boards) < 2 or np.bincount(named).min() < LEAST_RUNS:
         return []
     table = np.array([[each[key] for key in keys] for each in values], dtype=np.float64)
-    named = np.array([boards.index(run.board) for run in runs])
-    away = np.full((len(runs), len(boards), len(keys)), np.inf)
-    for number in range(len(runs)):
-        for board in range(len(boards)):
-            others = (named == board) & (np.arange(len(runs)) != number)
-            if others.sum() >= LEAST_RUNS - (named[number] == board):
-                away[number, board] = table[number] - np.median(table[others], axis=0)
-    own = away[np.arange(len(runs)), named]
-    if not np.isfinite(own).all():
-        return []
+    others = [(named == board) & (np.arange(len(runs)) != number) for number, board in enumerate(named)]
+    own = np.array([row - np.median(table[same], axis=0) for row, same in zip(table, others, strict=True)])
     scatter = (1 + FEW / len(runs)) * np.maximum(MAD_TO_SIGMA * np.median(np.abs(own), axis=0), 1e-30)
-    cost = np.square(away / scatter).sum(axis=2) / 2
-    before = cost[np.arange(len(runs)), named]
-    cost[np.arange(len(runs)), named] = np.inf
-    least = LEAST_LOG_ODDS + np.log(cost.size)
-    return [f"runs: {run.result} is named {run.board} and measures as {boards[cost[number].argmin()]} does: check which board it was"
-            for number, run in enumerate(runs) if before[number] - cost[number].min() > least]
+    middles = np.array([np.median(table[named == board], axis=0) for board in range(len(boards))])
+    least = LEAST_LOG_ODDS + np.log(len(runs) * len(boards))
+    said = []
+    for run, board, row, away in zip(runs, named, table, own, strict=True):
+        cost = np.square((row - middles) / scatter).sum(axis=1) / 2
+        cost[board] = np.inf
+        if np.square(away / scatter).sum() / 2 - cost.min() > least:
+            said.append(f"runs: {run.result} is named {run.board} and measures as {boards[cost.argmin()]} does: check which board it was")
+    return said
 
 
 def _compared(runs: Sequence[GaugeRun], inputs: Sequence[Mapping[str, Any]]) -> list[str]:
