@@ -1,24 +1,25 @@
 """The options of `relit calibrate`: one frozen model for each kind."""
 
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Self
+from typing import Annotated, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from service.requests.base.base import CAPTURE, Choice, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from service.requests.base.option_values import (
+    AlbedoText,
+    Circle,
+    CircleText,
+    Corners,
+    CornersText,
+    LevelsText,
+    MarkerSide,
+    SquareSide,
+    StepHeight,
+    refuse,
+)
 from stage.model import Count, Finite, Positive
 
-
-def _refuse(sentence: str) -> NoReturn:
-    from service.errors import RequestError  # which knows the errors of the kernels: not for a client, which imports this
-
-    raise RequestError(sentence)
-
-
-Corners = Annotated[int, Field(ge=3)]
-LARGEST_SQUARE_M = 1.0
-"""The largest side of a square of a chessboard, metres: larger numbers are millimetres."""
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
 POSES = Spelling(argument=True, metavar="CAPTURE...")
 LEAST_GREYS = 3
@@ -32,70 +33,6 @@ class Markers(Choice):
     APRILTAG16H5, APRILTAG25H9, APRILTAG36H11 = "apriltag16h5", "apriltag25h9", "apriltag36h11"
 
 
-class Circle(Options):
-    """The outline of a ball in the image."""
-
-    u: Finite
-    v: Finite
-    radius_px: Positive
-
-
-def _numbers(text: str) -> list[float]:
-    """Return the finite numbers of a text with commas between them; none where it holds anything else."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        return []
-    return values if all(abs(value) < float("inf") for value in values) else []
-
-
-def _circle(given: Any) -> Any:
-    if not isinstance(given, str):
-        return given
-    values = _numbers(given)
-    if len(values) != 3:
-        _refuse(f"--ball {given}: give centre and radius in pixels, such as 812.5,604,230")
-    return dict(zip(Circle.model_fields, values, strict=True))
-
-
-def albedo_channels(given: Any) -> Any:
-    """Return the albedo of three channels of a text with one number or three."""
-    if not isinstance(given, str):
-        return tuple(given) if isinstance(given, list) else given
-    values = _numbers(given)
-    if len(values) not in (1, 3):
-        _refuse(f"--albedo {given}: give one number or three, such as 0.18")
-    return tuple(values * 3 if len(values) == 1 else values)
-
-
-def board_corners(given: Any) -> Any:
-    """Return the inner corners of a chessboard, across and down, that a text such as 9x6 names."""
-    if not isinstance(given, str):
-        return tuple(given) if isinstance(given, list) else given
-    parts = given.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        _refuse(f"--board {given}: give two whole numbers with an x between, as 9x6")
-    return tuple(map(int, parts))
-
-
-def _in_metres(given_m: float | None, *, option: str, what: str) -> Any:
-    """Return a length, which is refused where it seems to be in millimetres."""
-    if given_m is not None and given_m > LARGEST_SQUARE_M:
-        _refuse(f"{option} {given_m:g}: is {given_m:g} m, more than {what} has: give metres, such as {given_m / 1000:g} for {given_m:g} mm")
-    return given_m
-
-
-SquareSide = AfterValidator(partial(_in_metres, option="--square-m", what="a square of a chessboard"))
-MarkerSide = AfterValidator(partial(_in_metres, option="--marker-m", what="a marker"))
-StepHeight = AfterValidator(partial(_in_metres, option="--step-m", what="a step"))
-
-
-def _levels(given: Any) -> Any:
-    if isinstance(given, tuple) and given and not _numbers(text := ",".join(map(str, given))):
-        _refuse(f"--levels {text}: give numbers from 0 to 1 with commas between")
-    return given
-
-
 class LightsOptions(Options):
     """Base of what is chosen to measure lights."""
 
@@ -106,7 +43,7 @@ class LightsOptions(Options):
 class BallOptions(LightsOptions):
     """Base of what is chosen to look at balls."""
 
-    circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
+    circles: Annotated[tuple[Annotated[Circle, CircleText], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
     """Outline of a ball: centre and radius in pixels. Give one for each ball; without it and without a mask, the balls are found
     in the images."""
 
@@ -130,7 +67,7 @@ class LightPositionsOptions(MirrorBallOptions):
 class GreyBallOptions(BallOptions):
     """Albedo, radius and distance of the grey ball."""
 
-    albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(albedo_channels), Spelling(metavar="R,G,B")] = None
+    albedo: Annotated[tuple[Positive, Positive, Positive] | None, AlbedoText, Spelling(metavar="R,G,B")] = None
     """Albedo of the ball, one number or three; None: only ratios of irradiance are measured, and their mean is set to 1."""
     refine_direction: bool = False
     """Take the direction of distant lights from the shading, in place of the manifest."""
@@ -242,19 +179,19 @@ class MarkerOptions(Options):
     def check_markers(self, square_m: float | None) -> None:
         """Refuse markers without a side, without a board, or wider than its squares."""
         if (self.markers is None) != (self.marker_m is None):
-            _refuse("--markers and --marker-m belong together: give both for a ChArUco board, or neither for a chessboard")
+            refuse("--markers and --marker-m belong together: give both for a ChArUco board, or neither for a chessboard")
         if self.marker_m is None:
             return
         if square_m is None:
-            _refuse("--markers are printed on a board: give --board and --square-m")
+            refuse("--markers are printed on a board: give --board and --square-m")
         if self.marker_m >= square_m:
-            _refuse(f"--marker-m {self.marker_m:g}: is not smaller than the squares (--square-m {square_m:g}), in which the markers lie")
+            refuse(f"--marker-m {self.marker_m:g}: is not smaller than the squares (--square-m {square_m:g}), in which the markers lie")
 
 
 class BoardOptions(MarkerOptions):
     """Corners and squares of the chessboard or ChArUco board."""
 
-    board: Annotated[tuple[Corners, Corners], BeforeValidator(board_corners), Spelling(metavar="9x6")]
+    board: Annotated[tuple[Corners, Corners], CornersText, Spelling(metavar="9x6")]
     """Inner corners of the board, across and down: one fewer than its squares."""
     square_m: Annotated[Positive, SquareSide]
     """Side of a square in metres."""
@@ -295,7 +232,7 @@ class StereoRequest(BoardOptions):
 class LaserPlanesOptions(MarkerOptions):
     """The target under the stripes of the laser: a chessboard or ChArUco board, or a step."""
 
-    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
+    board: Annotated[tuple[Corners, Corners] | None, CornersText, Spelling(metavar="9x6")] = None
     """Inner corners of the board, across and down: one fewer than its squares."""
     square_m: Annotated[Positive | None, SquareSide] = None
     """Side of a square of the board in metres."""
@@ -307,11 +244,11 @@ class LaserPlanesOptions(MarkerOptions):
     @model_validator(mode="after")
     def _one_target(self) -> Self:
         if self.drop_failed and self.step_m is not None:
-            _refuse("--drop-failed is for boards: the planes on a step are found together")
+            refuse("--drop-failed is for boards: the planes on a step are found together")
         if (self.board is None) != (self.square_m is None):
-            _refuse("--board and --square-m belong together: give both, or --step-m")
+            refuse("--board and --square-m belong together: give both, or --step-m")
         if (self.board is None) == (self.step_m is None):
-            _refuse("give --board and --square-m for a chessboard, or --step-m for a step of known height")
+            refuse("give --board and --square-m for a chessboard, or --step-m for a step of known height")
         self.check_markers(self.square_m)
         return self
 
@@ -330,7 +267,7 @@ class LaserPlanesRequest(LaserPlanesOptions, DeviceRequest):
 class ResponseOptions(Options):
     """The levels of the images of evenly grey projections."""
 
-    levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
+    levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], LevelsText, Commas, Spelling(metavar="0,0.25,…")] = ()
     """Level of each image, 0 to 1; without it even steps from 0 to 1 in the order of the images."""
 
 

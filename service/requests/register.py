@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from service.requests.base.base import Choice, Commas, DeviceRequest, Options, Role, Spelling
-from service.requests.calibrate import Corners, Markers, board_corners
+from service.requests.base.option_values import Corners, CornersText
+from service.requests.calibrate import Markers
 from stage.model import Finite, Fraction, Line, NotNegative, Positive
 
 Unit = Literal["m", "cm", "mm", "um", "in"]
@@ -55,7 +56,7 @@ class RegisterOptions(Options):
     markers: Markers | None = None
     """Set of coded markers, printed and stuck around the object, that are looked for in the images of range images and used as targets.
     None: none are looked for."""
-    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
+    board: Annotated[tuple[Corners, Corners] | None, CornersText, Spelling(metavar="9x6")] = None
     """Inner corners of a chessboard that stands beside the object, across and down, one number odd and one even; it is looked for in the
     images of range images and its corners are used as targets. None: none is looked for."""
 

@@ -24,6 +24,7 @@ from service.scans.registration.look_alikes import looks_alike_turned
 from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
+from service.scans.registration.refusals import refusal, refused_targets
 from service.scans.registration.seen_through import open_pairs, wrongly_joined
 from service.scans.registration.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from stage.errors import ScanError
@@ -177,8 +178,8 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         ambiguous = any(pair.state is PairState.AMBIGUOUS and number in (pair.a, pair.b) for pair in pairs.values())
         words = None if ambiguous else why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
                                                   least_overlap=options.least_overlap)  # what looks alike turned does so mirrored
-        words = words or _refusal(number, names, pairs.values(), starts[number] is not None and not options.starts_decide)
-        alone[number] = words + _refused_targets(number, names, shown, targeted.values())
+        words = words or refusal(number, names, pairs.values(), starts[number] is not None and not options.starts_decide)
+        alone[number] = words + refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:
         raise NoneJoinedError(names, alone, (*pairs.values(), *targeted.values()))
@@ -324,28 +325,3 @@ def edge_of(pair: Pair) -> Edge:
 
 def _reference(numbers: Iterable[int], starts: Sequence[np.ndarray | None], options: RegistrationOptions) -> int:
     return min(numbers, key=lambda number: (number != options.reference, starts[number] is None, number))
-
-
-def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair], may_decide: bool) -> str:
-    """Return why a scan could not be joined, by the pair that came nearest to it; `may_decide`: it has a start, which does not."""
-    tried = [pair for pair in pairs if number in (pair.a, pair.b) and pair.state is not PairState.NO_POSE]
-    if not tried:
-        return "has no surface in common with the others"
-    ambiguous = [pair for pair in tried if pair.state is PairState.AMBIGUOUS]
-    joined = [pair for pair in tried if pair.state is PairState.JOINED]
-    best = max(ambiguous or joined or tried, key=lambda pair: pair.overlap)
-    other = names[best.b if best.a == number else best.a]
-    if best.state is PairState.JOINED:
-        return f"is joined with {other} alone, and neither with the largest group of scans"
-    advice = {PairState.AMBIGUOUS: ": give its turntable or pose and keep that fixed",
-              PairState.CONTRADICTED: ": --starts joins it if its start is right" if may_decide else ""}
-    return f"against {other}, {best.reason}{advice.get(best.state, '')}"
-
-
-def _refused_targets(number: int, names: Sequence[str], shown: Mapping[int, Sequence[Target]], pairs: Iterable[Pair]) -> str:
-    """Return why the targets of a scan that could not be joined place it against no other, to go behind the reason of its surfaces."""
-    tried = [pair for pair in pairs if number in (pair.a, pair.b)]
-    if not tried:
-        return "; no other scan shows any of its targets" if number in shown else ""
-    best = max(tried, key=lambda pair: (pair.fit is not None, pair.overlap))
-    return f"; against {names[best.b if best.a == number else best.a]}, {best.reason}" if best.reason else ""
