@@ -26,6 +26,7 @@ from warp._src import context
 from warp._src.codegen import StructInstance
 
 from kernels import device as devices
+from kernels import graphs
 from tests import emulated_streams
 from tests.emulated_streams import LAUNCHES, PINNED, Event, Stream
 
@@ -43,7 +44,7 @@ MEMORY = 8 << 30
 
 plain_launch, plain_load, plain_total_memory = context.launch, context.Module.load, context.Device.total_memory
 plain_copy, plain_empty, plain_from_data, plain_free_memory = wp.copy, wp.empty, wp.array._init_from_data, context.Device.free_memory
-plain_repeated = devices.Repeated.run
+plain_repeated = graphs.Repeated.run
 WAITS = "synchronize", "synchronize_device", "synchronize_stream", "synchronize_event"
 
 COUNTED = {"launches": "launches of kernels and of graphs", "graphed": "launches of kernels within graphs",
@@ -218,7 +219,7 @@ def counting_waits(synchronise: Any) -> Any:
     return wait
 
 
-def counting_graphs(repeated: devices.Repeated) -> None:
+def counting_graphs(repeated: graphs.Repeated) -> None:
     """Do the launches of a graph, which are one."""
     if repeated.device == NAME:
         note(launches=1)
@@ -256,7 +257,7 @@ def install() -> None:
     wp.launch = context.launch = launch
     wp.copy = context.copy = copy_array
     wp.empty = context.empty = empty
-    devices.Repeated.run = counting_graphs
+    graphs.Repeated.run = counting_graphs
     atexit.register(Stream.forget)
     wp.Stream, wp.Event, wp.get_stream, wp.synchronize_event = Stream, Event, lambda device=None: LAUNCHES, Event.synchronize
     for name in WAITS:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from kernels import device as devices
+from kernels import graphs
 from kernels.device import to_numpy
 from kernels.surface.grid import EdgeWeights, Grid, Summer, Walk, end_cell, first_cell, run
 from kernels.surface.multigrid import Multigrid
@@ -158,13 +158,13 @@ class Solver:
     ) -> Convergence:
         """Improve h until the preconditioned residual norm is below tolerance times its first value, or near it and falls no more.
         Returns how the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA."""
-        grid, every = self.grid, CHECK_EVERY if self.grid.device != "cpu" or devices.has_graphs("cpu") else 1
+        grid, every = self.grid, CHECK_EVERY if self.grid.device != "cpu" or graphs.has_graphs("cpu") else 1
         run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)
         wp.copy(self.p, self.z)
         start = square = least = self._square(0)
         goal, step = (tolerance * math.sqrt(start)) ** 2, 0
-        group = devices.Repeated(lambda: self._iterate(h, goal, range(step, step + every)), grid.device)
+        group = graphs.Repeated(lambda: self._iterate(h, goal, range(step, step + every)), grid.device)
         while square > goal and step < self.max_iterations:
             if step + every <= self.max_iterations:
                 group.run()

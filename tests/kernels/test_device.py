@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import ahead
+from kernels import ahead, graphs
 from kernels import device as devices
 from kernels.errors import ArrayError, DeviceError
 
@@ -63,7 +63,7 @@ def test_many_threads_read_and_graphs_are_captured_afterwards(device):
     with ThreadPoolExecutor(4) as pool:
         assert all((read == np.arange(4096)).all() for read in pool.map(lambda _: devices.to_numpy(values), range(400)))
     visits = wp.zeros(4096, dtype=int, device=device)
-    work = devices.Repeated(lambda: devices.launch(count_visits, 4096, [1], [visits], device=device), device)
+    work = graphs.Repeated(lambda: devices.launch(count_visits, 4096, [1], [visits], device=device), device)
     work.run()
     work.run()
     assert (devices.to_numpy(visits) == 2).all()

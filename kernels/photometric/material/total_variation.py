@@ -16,7 +16,7 @@ primal-dual steps of Pock and Chambolle, "Diagonal preconditioning for first ord
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
+from kernels import graphs
 from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.surface.grid import Walk, end_cell, first_cell, make_grid, run
@@ -126,7 +126,7 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
             run(_pull, grid.cells, [weights, ahead, way], [forces])
             run(_move, grid.cells, [given, size, trusted, forces, way], [found, ahead])
 
-    group = devices.Repeated(steps, device)
+    group = graphs.Repeated(steps, device)
     for _ in range(GROUPS):
         group.run()
     # the minimum takes no value beyond those that pixels say; steps towards it may
