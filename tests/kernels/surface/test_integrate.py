@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import graphs
 from kernels.errors import ArrayError
 from kernels.surface.conjugate import CHECK_EVERY
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
@@ -186,14 +187,14 @@ def test_a_tolerance_below_rounding_spoils_nothing(device):
 
 def test_graphs_of_launches_give_the_same(monkeypatch):
     """Warp captures and replays launches on the CPU too, as long as one core makes them."""
-    shape, graphs = shapes.bumps(60, shapes.ragged_mask(60, 60)), []
+    shape, launched = shapes.bumps(60, shapes.ragged_mask(60, 60)), []
     plain = solve(shape, "cpu")
     launch_graph = wp.capture_launch
     monkeypatch.setattr(graphs, "has_graphs", lambda device: True)
-    monkeypatch.setattr(wp, "capture_launch", lambda graph: graphs.append(graph) or launch_graph(graph))
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: launched.append(graph) or launch_graph(graph))
     result = solve(shape, "cpu")
-    assert len(graphs) > len(set(graphs)) == 1  # one graph, launched several times
-    assert len(graphs) == -(-plain.iterations // CHECK_EVERY)
+    assert len(launched) > len(set(launched)) == 1  # one graph, launched several times
+    assert len(launched) == -(-plain.iterations // CHECK_EVERY)
     found, expected = result.height.numpy()[shape.mask], plain.height.numpy()[shape.mask]
     # the last group goes on to the goal on the device, and no further
     np.testing.assert_array_equal(found, expected)
