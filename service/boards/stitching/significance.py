@@ -249,6 +249,7 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     seen = np.where(np.isfinite(measured.height), measured.height - offset, whole)
     right, up = (max(sigma / measured.grid.pixel_m, MATCH_PX) for sigma in shift_sigma_m)
     edges = np.maximum(*(edge_variance(bends(heights), noise) for heights in (whole, seen)))
-    edges += shift_error(whole, (right, up), noise) ** 2
+    # a wall that one map alone has hides by its place neither that it is there nor that it is missing
+    edges += np.minimum(*(shift_error(heights, (right, up), noise) for heights in (whole, (whole + seen) / 2))) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
     return HeightMap(measured.grid, deviation, variance, np.where(known, systematic, np.nan))
