@@ -33,6 +33,9 @@ BINS = 4
 LEAST_SHARE, MOST_SHARE = 1e-4, 2.0
 """Bounds of the share: above the second, motion and not noise differs between neighbours."""
 
+Estimate = tuple[np.ndarray, np.ndarray]
+"""Values [rows, cols, k] and their variance by noise [rows, cols]."""
+
 
 def noise_share(
     difference: np.ndarray,  # [rows, cols, k] of two steps
@@ -124,6 +127,15 @@ def advance(track: Track, new: Track, joined: np.ndarray, *, unit: bool = False)
     """Return the track after a further step.
     `new`: of the step alone, of `begin`. `joined`: [rows, cols] bool, where both agree; elsewhere the step stands alone. `unit`: whether
     means are directions."""
+    gain, (mean, noise), (recent, recent_noise) = _means(track, new, joined, unit)
+    constant = np.where(joined, track.constant + gain * (new.constant - track.constant), new.constant).astype(np.float32)
+    lag = np.maximum((1 - gain) ** 2 * _beyond(new.mean - track.mean, new.noise + track.noise, joined),
+                     _beyond(recent - mean, np.maximum(recent_noise - noise, 0), joined)).astype(np.float32)
+    return Track(mean, noise, constant, np.where(joined, track.count + 1, new.count).astype(np.int32), recent, recent_noise, lag)
+
+
+def _means(track: Track, new: Track, joined: np.ndarray, unit: bool) -> tuple[np.ndarray, Estimate, Estimate]:
+    """Return the weight of a further step in the mean, [rows, cols], and after it the mean of all steps and that of the last ones."""
     gain = np.where(joined, np.maximum(track.noise / np.maximum(track.noise + new.noise, 1e-30), 1 / MEMORY), 1).astype(np.float32)
     equal = joined & (track.noise + new.noise == 0)
     gain = np.where(equal, 1 / (track.count + 1), gain).astype(np.float32)
@@ -134,10 +146,7 @@ def advance(track: Track, new: Track, joined: np.ndarray, *, unit: bool = False)
     mean, recent = (np.where(joined[..., None], values, new.mean).astype(np.float32) for values in (mean, recent))
     noise, recent_noise = (np.where(joined, (1 - weight) ** 2 * before + weight**2 * new.noise, new.noise).astype(np.float32)
                            for before, weight in ((track.noise, gain), (track.recent_noise, quick)))
-    constant = np.where(joined, track.constant + gain * (new.constant - track.constant), new.constant).astype(np.float32)
-    lag = np.maximum((1 - gain) ** 2 * _beyond(new.mean - track.mean, new.noise + track.noise, joined),
-                     _beyond(recent - mean, np.maximum(recent_noise - noise, 0), joined)).astype(np.float32)
-    return Track(mean, noise, constant, np.where(joined, track.count + 1, new.count).astype(np.int32), recent, recent_noise, lag)
+    return gain, (mean, noise), (recent, recent_noise)
 
 
 def _beyond(difference: np.ndarray, variance: np.ndarray, joined: np.ndarray) -> np.ndarray:
@@ -152,5 +161,5 @@ def _beyond(difference: np.ndarray, variance: np.ndarray, joined: np.ndarray) ->
 def steady(track: Track, new: Track, joined: np.ndarray, freedom: int, *, unit: bool = False) -> np.ndarray:
     """Return where the mean after a further step does not lag behind the last steps, as it does behind what moves slowly, [rows, cols]
     bool; arguments are those of `advance`, with the freedom of `noise_share`."""
-    after = advance(track, new, joined, unit=unit)
-    return agree(after.recent - after.mean, np.maximum(after.recent_noise - after.noise, 0), joined, freedom)
+    _, (mean, noise), (recent, recent_noise) = _means(track, new, joined, unit)
+    return agree(recent - mean, np.maximum(recent_noise - noise, 0), joined, freedom)

@@ -7,7 +7,7 @@ the camera. Heights are z. A grid is an orthographic camera that looks along -z,
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import correlate1d, uniform_filter
 
 from stage.capture.camera import Camera
 from stage.spread import MAD_TO_SIGMA
@@ -131,9 +131,9 @@ def bends(height: np.ndarray) -> np.ndarray:
         middle = image[:, 1:-1]
         across = sum(np.where(np.isfinite(other), other - middle, 0) for other in (image[:, :-2], image[:, 2:]))
         known = np.isfinite(middle)
-        weights = np.stack([known[:-2], 2 * known[1:-1], known[2:]])
-        values = np.stack([np.where(known, across, 0)[k : len(known) - 2 + k] for k in range(3)])
-        second.append((weights * values).sum(axis=0) / np.maximum(weights.sum(axis=0), 1))
+        total, weight = (correlate1d(values, [1.0, 2.0, 1.0], axis=0)[1:-1]
+                         for values in (np.where(known, across, 0), known.astype(np.float64)))
+        second.append(total / np.maximum(weight, 1))
     return np.where(np.isfinite(height), np.maximum(np.abs(second[0]), np.abs(second[1].T)), np.nan)
 
 
@@ -156,8 +156,10 @@ def shift_error(
     """
     error = np.zeros(height.shape)
     for side in (1, *SMOOTHED):
-        means, left = local_means(height, side), noise / side
-        means = np.where(np.abs(means - height) < FLAT * noise, means, np.nan) if side > 1 else height
+        means, left = height, noise / side
+        if side > 1:
+            means = local_means(height, side)
+            means = np.where(np.abs(means - height) < FLAT * noise, means, np.nan)
         across, down, gain = gradients(means)
         clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * left
         error = np.maximum(error, np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0))

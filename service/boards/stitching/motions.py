@@ -11,13 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.stitching.overlap import LATERAL, RANK, UNKNOWNS, Evidence, Overlap
+from service.boards.stitching.overlap import LATERAL, UNKNOWNS, Evidence, Overlap
 
 ROUNDS = 30
 FAR_PX = 1.0
 """Pixels from which on a measured shift contradicts the shifts of the other overlaps."""
 HALF_WEIGHT_PX = 0.5
 """The contradiction, in pixels, at which a shift has half its weight."""
+RANK = 1e-12
+"""Eigenvalues below this part of the largest belong to what is not determined."""
 
 
 class Motions(NamedTuple):

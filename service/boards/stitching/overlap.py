@@ -42,8 +42,6 @@ CLEAR_DIRECTION = 10.0
 """Information about a shift counts in directions where it is this many times what the noise of slopes alone gives."""
 LEAST_CLEAR = 150
 """The fewest pixels with a clear slope that measure a shift."""
-RANK = 1e-12
-"""Eigenvalues below this part of the largest belong to what is not determined."""
 LEAST_LOG_ODDS = 7.0
 """Log odds (1000 : 1) by which the best shift must be more probable than any other; else the shift counts as not measured."""
 
