@@ -10,7 +10,7 @@ from kernels.photometric.model.samples import evenly
 from service.calibrate.results import LightCaptures, digits
 from service.calibrate.solvers.apply import LitFrame, as_direction
 from service.calibrate.solvers.ball_search import find_outlines, outline_near
-from service.calibrate.solvers.mirror_ball import find_spot
+from service.calibrate.solvers.mirror_ball import find_spot, still_light
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, fit_circle, project, view_ball
 from service.light_estimation.grey_ball import fit_brightness, fit_direction
@@ -109,6 +109,12 @@ def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]
                                 f"--ball-radius-m says {radius:.4g}")
 
 
+def still_on(captures: LightCaptures, views: Sequence[BallView]) -> list[np.ndarray | None]:
+    """Return what up to 16 frames of a capture all show on each ball, [h, w] in the box of its view; None for two frames or fewer."""
+    seen = _seen_in(captures, views)
+    return [still_light([each.radiance for each in frames], [each.saturated for each in frames]) for frames in seen]
+
+
 def ball_entry(ball: Ball) -> dict[str, Any]:
     """Return a ball as the report holds it."""
     unit = "m" if ball.metric else "px or radii"
@@ -158,9 +164,10 @@ class _Found(NamedTuple):
 def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> _Found:
     def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
         places = []
+        still = still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
         for seen in frames:
             try:
-                places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level).uv)
+                places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level, still=still).uv)
             except CalibrationError:
                 continue
         if len(places) < LEAST_FRAMES * len(frames):
@@ -198,12 +205,7 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
     outlines = find_outlines(camera, pictures)[:CANDIDATES]
     placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
     views = [view_ball(ball, camera) for _, ball in placed]
-    seen: list[list[_Seen]] = [[] for _ in placed]
-    for number in evenly(len(captures.lit), FRAMES):
-        lit = captures.lit[number]
-        frame = correction.apply(lit.frame)
-        for view, frames in zip(views, seen, strict=True):
-            frames.append(_Seen(lit, frame.pixels[view.box], None if frame.saturated is None else frame.saturated[view.box]))
+    seen = _seen_in(captures, views)
     balls: list[Ball] = []
     for (_, ball), view, frames in zip(placed, views, seen, strict=True):
         if brightest[view.box][view.inside].max(initial=0) < DARK or any(_overlap(camera, ball, other) for other in balls):
@@ -211,6 +213,18 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
         if is_ball(ball, view, frames):
             balls.append(ball)
     return _Found(balls, len(outlines))
+
+
+def _seen_in(captures: LightCaptures, views: Sequence[BallView]) -> list[list[_Seen]]:
+    """Return the pixels of up to 16 frames within each outline."""
+    correction = Correction.of(captures.source)
+    seen: list[list[_Seen]] = [[] for _ in views]
+    for number in evenly(len(captures.lit), FRAMES):
+        lit = captures.lit[number]
+        frame = correction.apply(lit.frame)
+        for view, frames in zip(views, seen, strict=True):
+            frames.append(_Seen(lit, frame.pixels[view.box], None if frame.saturated is None else frame.saturated[view.box]))
+    return seen
 
 
 def _pictures(captures: LightCaptures, correction: Correction, most: int) -> list[np.ndarray]:

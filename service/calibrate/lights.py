@@ -7,7 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.balls import ball_entry, balls_of, check_metric, compared, find_grey_ball, find_mirror_ball, find_mirror_balls
+from service.calibrate.balls import (
+    ball_entry,
+    balls_of,
+    check_metric,
+    compared,
+    find_grey_ball,
+    find_mirror_ball,
+    find_mirror_balls,
+    still_on,
+)
 from service.calibrate.results import (
     LightCalibration,
     LightCaptures,
@@ -37,6 +46,8 @@ READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
 UNSURE = 0.05
 """Median uncertainty of the brightness of lights, relative, from which the object is said to be none to measure them on."""
+WIDE = 2.0
+"""The size of the spot of a lamp over the median of all, from which something beside the lamp may be a part of it."""
 BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
@@ -46,6 +57,7 @@ class BallPixels(NamedTuple):
 
     radiance: np.ndarray  # [h, w, 3] float32
     saturated: np.ndarray | None  # [h, w] bool
+    still: np.ndarray | None = None  # [h, w] what all frames show
 
 
 def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> LightCalibration:
@@ -61,7 +73,7 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
     targets = _targets(captures)
 
     def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
-        spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, level=request.level)
+        spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, level=request.level, still=patches[0].still)
         light = targets[lit.number]
         flags = [*spot.flags, *(["irradiance set to 1"] if isinstance(light, PointLight) else [])]
         entry = {"direction": digits(spot.direction), "uncertainty_degrees": round(spot.uncertainty_degrees, 4),
@@ -70,10 +82,26 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
         row = (three_numbers(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
         return MeasuredLight(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
 
-    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, still_on(captures, [view])),
+                                 drop_failed=request.drop_failed)
+    results = _with_wide_spots(results)
     timings.close()
     return write_lights("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
                         summary={"balls": [ball_entry(ball)]}, warnings=warnings)
+
+
+def _with_wide_spots(results: Sequence[MeasuredLight]) -> list[MeasuredLight]:
+    """Return lights measured on a mirror ball, as unsure as their spot is wide where it is wider than those of the other lights: what
+    stands beside a lamp and mirrors it may be a part of such a spot."""
+    sizes = [result.entry["spot_degrees"] for result in results if result.light is not None]
+    held = []
+    for result in results:
+        if result.light is not None and result.entry["spot_degrees"] > WIDE * float(np.median(sizes)):
+            doubt = float(np.hypot(result.doubt, result.entry["spot_degrees"]))
+            entry = {**result.entry, "uncertainty_degrees": round(doubt, 4), "flags": [*result.entry["flags"], "wider than the others"]}
+            result = result._replace(entry=entry, row=(result.row[0], f"{doubt:.2f}°", *result.row[2:]), doubt=doubt)
+        held.append(result)
+    return held
 
 
 def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> LightCalibration:
@@ -93,7 +121,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         spots = []
         for number, (patch, ball, view) in enumerate(zip(patches, balls, views, strict=True), start=1):
             try:
-                spots.append(find_spot(patch.radiance, patch.saturated, ball, view, level=request.level))
+                spots.append(find_spot(patch.radiance, patch.saturated, ball, view, level=request.level, still=patch.still))
             except CalibrationError as error:
                 raise CalibrationError(f"ball {number}: {error}") from error
         found = nearest_point(np.array([spot.point for spot in spots]), np.array([spot.direction for spot in spots]),
@@ -104,7 +132,8 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         row = (three_numbers(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
         return MeasuredLight(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
 
-    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings, still_on(captures, views)),
+                                 drop_failed=request.drop_failed)
     timings.close()
     missed = sum(MISSES in result.entry["flags"] for result in results)
     if not named and 2 * missed > len(results):
@@ -179,14 +208,14 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],
                   measure: Callable[[LitFrame, Sequence[BallPixels]], MeasuredLight],
-                  timings: Timings) -> list[MeasuredLight | CalibrationError]:
+                  timings: Timings, still: Sequence[np.ndarray | None] = (None,)) -> list[MeasuredLight | CalibrationError]:
     """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured."""
     correction = Correction.of(captures.source)
 
     def one(lit: LitFrame) -> MeasuredLight | CalibrationError:
         radiance = correction.apply(lit.frame)
-        patches = [BallPixels(radiance.pixels[view.box], None if radiance.saturated is None else radiance.saturated[view.box])
-                   for view in views]
+        patches = [BallPixels(radiance.pixels[view.box], None if radiance.saturated is None else radiance.saturated[view.box], rest)
+                   for view, rest in zip(views, still, strict=True)]
         try:
             return measure(lit, patches)
         except CalibrationError as error:

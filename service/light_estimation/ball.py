@@ -96,14 +96,13 @@ def ball_from_outline(
     outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
     Raises CalibrationError if the points lie on no circle."""
     origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
-    span = np.linalg.norm(outline - outline.mean(axis=0), axis=1)
-    radius_px = float(span.mean())
     try:
         if camera.projection == "orthographic":
             centre, radius = fit_circle(origin[:, :2])
             return Ball(np.array([*centre, z_m or 0.0]), radius, camera.pixel_size_m is not None,
                         radius / (camera.pixel_size_m or 1.0), error_px)
         axis, half_angle = fit_cone(direction)
+        _, radius_px = fit_circle(outline)  # of a part of it too
     except np.linalg.LinAlgError as error:
         raise CalibrationError("the outline of the ball lies on a line") from error
     radius = 1.0 if radius_m is None else radius_m

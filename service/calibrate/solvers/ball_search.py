@@ -1,8 +1,8 @@
 """Round outlines in the images of a capture, among which a chrome or grey ball is looked for.
 
 Circles are proposed by the Hough transform on the mean and on the brightest of all frames, in both of which the ball stands still.
-Then the strongest step of brightness along each of its radii is found to a fraction of a pixel, and the outline of a ball is fitted to
-these points by RANSAC, so that objects that hide part of the ball do not bend it.
+Then the sharpest steps of brightness along each of its radii are found to a fraction of a pixel, and the outline of a ball is fitted to
+these points by RANSAC, so that objects that hide part of the ball, and what it shows near its rim, do not bend it.
 
 Sources: Yuen, Princen, Illingworth and Kittler, "Comparative study of Hough transform methods for circle finding", Image and Vision
 Computing 8(1), 1990; Fischler and Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981.
@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
-from service.light_estimation.ball import Ball, ball_from_outline, project, refine_outline
+from service.light_estimation.ball import Ball, ball_from_outline, fit_circle, project, refine_outline
 from stage.capture.camera import Camera
 from stage.errors import CalibrationError
 
@@ -33,16 +34,21 @@ RAYS = 360
 """The radii along which the outline is looked for."""
 REACH = 0.12
 """The outline lies within this part of the radius of the proposed circle."""
+SMOOTH_PX, SMOOTH_RAYS = 4.0, 2.0
+"""The standard deviation, in pixels, of the mean that is taken off before steps are looked for, and that in radii of the mean along the
+outline."""
 STEP_PX = 0.25
 """The distance of samples along a radius."""
-ERROR_PX = 0.5
-"""The least standard error of the centre that is assumed: the rim of a real mirror shows what stands around it, and its outline lay 1.2 px
-from that of a mask drawn by hand."""
+ERROR_PX = 1.0
+"""The least standard error of the centre that is assumed where the whole outline is seen: the rim of a real mirror shows what stands around
+it, and its outline lay 1.2 px from that of a mask drawn by hand."""
 LEAST_SHARE = 0.45
 """The least part of the radii whose step of brightness lies on the outline: half of a ball may be hidden."""
-TRIPLES, NEAR_PX = 200, 1.5
-"""Circles of RANSAC, of which 1e-11 miss where half the points lie on one, and the largest distance of a point near a circle: a pixel, and
-what the ellipse of a perspective camera differs from one."""
+STEPS, CLEAR = 3, 4.0
+"""The most steps of brightness along a radius that may be the outline, and how much steeper they are than the median."""
+TRIPLES, NEAR_PX = 1000, 1.5
+"""Circles of RANSAC, of which one in a million misses where a quarter of the points lies on one, and the largest distance of a point near a
+circle: a pixel, and what the ellipse of a perspective camera differs from one."""
 SAME = 0.08
 """Circles whose centres and radii differ by less than this part of the radius are one."""
 
@@ -101,42 +107,59 @@ def _proposals(picture: np.ndarray) -> list[tuple[float, float, float]]:
 
 def _examine(camera: Camera, pictures: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
     """Return the outline of a ball near a circle, or None where too few steps of brightness lie on one."""
+    first = _outline_about(camera, pictures, u, v, radius)
+    if first is None:
+        return None
+    # radii of the outline itself cross it at a right angle, so that means along it are sharp
+    (u, v), radius = fit_circle(first.points)
+    return _outline_about(camera, pictures, u, v, radius) or first
+
+
+def _outline_about(camera: Camera, pictures: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
+    """Return the outline with most of the radii of a circle."""
     turn = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)[:, None]
     along = np.arange(radius * (1 - REACH) - 2, radius * (1 + REACH) + 2, STEP_PX)
     at_u, at_v = u + along * np.cos(turn), v + along * np.sin(turn)
     best: RoundOutline | None = None
     for picture in pictures:
         rows, cols = picture.shape
-        blurred = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.0)
-        values = cv2.remap(blurred, (at_u - 0.5).astype(np.float32), (at_v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
+        # what changes over many pixels is what the ball shows, and no outline
+        single = picture.astype(np.float32)
+        sharp = cv2.GaussianBlur(single, (0, 0), 1.0) - cv2.GaussianBlur(single, (0, 0), SMOOTH_PX)
+        values = cv2.remap(sharp, (at_u - 0.5).astype(np.float32), (at_v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
                            borderMode=cv2.BORDER_REPLICATE)
-        slope = np.abs(np.gradient(values.astype(np.float64), axis=1))
+        slope = np.abs(np.gradient(gaussian_filter1d(values.astype(np.float64), SMOOTH_RAYS, axis=0, mode="wrap"), axis=1))
         slope[(at_u < 1) | (at_u > cols - 1) | (at_v < 1) | (at_v > rows - 1)] = 0
-        top = slope[:, 1:-1].argmax(axis=1) + 1
-        ray = np.arange(RAYS)
-        left, peak, right = slope[ray, top - 1], slope[ray, top], slope[ray, top + 1]
-        bend = left - 2 * peak + right
-        shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0).clip(-1, 1)
-        clear = peak > max(1e-4, 0.1 * float(np.median(peak)))
-        distance = along[top] + shift * STEP_PX
-        points = np.stack([u + distance * np.cos(turn[:, 0]), v + distance * np.sin(turn[:, 0])], axis=1)[clear]
-        if len(points) < LEAST_SHARE * RAYS:
+        ray, distance = _steps(slope, along)
+        if len(np.unique(ray)) < LEAST_SHARE * RAYS:
             continue
-        inside = _on_a_circle(points)
-        if inside.sum() < LEAST_SHARE * RAYS:
-            continue
+        points = np.stack([u + distance * np.cos(turn[ray, 0]), v + distance * np.sin(turn[ray, 0])], axis=1)
         try:
-            ball, inside, error_px = refine_outline(camera, points, inside)
+            ball, inside, error_px = refine_outline(camera, points, _on_a_circle(points, ray))
         except CalibrationError:
             continue
-        share = float(inside.sum()) / RAYS
+        share = len(np.unique(ray[inside])) / RAYS
         if share >= LEAST_SHARE and (best is None or share > best.share):
-            best = RoundOutline(points[inside], ball, share, max(error_px, ERROR_PX))
+            best = RoundOutline(points[inside], ball, share, max(error_px, ERROR_PX / share))
     return best
 
 
-def _on_a_circle(points: np.ndarray) -> np.ndarray:
-    """Return which points lie near the circle through three of them that has most points near it."""
+def _steps(slope: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the clear steps of brightness along radii, at most STEPS each: the radius [steps], and the distance [steps] to a fraction of a
+    sample. `slope`: [radii, samples]. `along`: [samples] their distances."""
+    left, middle, right = slope[:, :-2], slope[:, 1:-1], slope[:, 2:]
+    top = np.where((middle >= left) & (middle > right), middle, 0)
+    clear = max(1e-4, CLEAR * float(np.median(middle)))
+    order = np.argsort(top, axis=1)[:, -STEPS:]
+    ray, rank = np.nonzero(np.take_along_axis(top, order, axis=1) > clear)
+    sample = order[ray, rank]
+    bend = left[ray, sample] - 2 * middle[ray, sample] + right[ray, sample]
+    shift = np.where(bend < 0, 0.5 * (left[ray, sample] - right[ray, sample]) / np.where(bend < 0, bend, -1), 0).clip(-1, 1)
+    return ray, along[sample + 1] + shift * (along[1] - along[0])
+
+
+def _on_a_circle(points: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """Return which points lie near the circle through three of them that has points of most rays near it."""
     chosen = np.random.default_rng(0).integers(0, len(points), (TRIPLES, 3))
     a, b, c = (points[chosen[:, corner]] for corner in range(3))
     first, second = b - a, c - a
@@ -148,7 +171,9 @@ def _on_a_circle(points: np.ndarray) -> np.ndarray:
                       axis=1) / divided[:, None]
     away = np.linalg.norm(points - (a + offset)[:, None], axis=2) - np.linalg.norm(offset, axis=1)[:, None]
     near = (np.abs(away) < NEAR_PX) & usable[:, None]
-    return np.asarray(near[near.sum(axis=1).argmax()])
+    starts = np.flatnonzero(np.diff(ray, prepend=-1))
+    rays = np.logical_or.reduceat(near, starts, axis=1).sum(axis=1)
+    return np.asarray(near[rays.argmax()])
 
 
 def _near(camera: Camera, ball: Ball, u: float, v: float, radius: float) -> bool:

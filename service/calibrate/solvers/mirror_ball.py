@@ -9,12 +9,14 @@ Source: the law of reflection, r = 2(n·v)n - v; Debevec, "Rendering synthetic o
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import label
 
 from service.light_estimation.ball import Ball, BallView
+from service.light_estimation.lambertian import degrees_between
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -32,8 +34,16 @@ MIN_CONTRAST = 2.0
 """The least ratio of the peak to that median."""
 RIVAL_SHARE = 0.5
 """The light of another spot, relative to the light of the found spot, above which the spot is flagged."""
+RIVAL_PEAK = 0.5
+"""The peak of that other spot, relative to the peak, above which it may as well be the lamp."""
+STILL_SHARE = 0.5
+"""The part of the light of a spot which all frames show there, above which the spot is none of the lamp of the frame."""
+LEAST_MOVING = 0.05
+"""The least peak of a spot beside one that stands still, relative to the peak of that: less is noise at its border."""
 SMALL_SPOT = 4
 """The count of pixels below which a spot is flagged, because its centroid is inaccurate."""
+LEAST_FRAMES = 3
+"""The fewest frames of which something can be said to stand still."""
 MIN_CONVERGENCE_DEGREES = 1.0
 """The least angle between two rays: below it an error of one pixel moves the light by as much as its distance."""
 MISS_DEGREES = 1.0
@@ -56,7 +66,8 @@ class Spot(NamedTuple):
     flags: tuple[str, ...]
 
 
-def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView, *, level: float = 0.1) -> Spot:
+def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView, *, level: float = 0.1,
+              still: np.ndarray | None = None) -> Spot:
     """Find the bright spot on a mirror ball, and the direction of the light that it reflects.
 
     Each pixel of the spot measures the light from its own reflected direction. The result is the mean of these directions, weighted
@@ -64,6 +75,8 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     that the mean is the centroid of the light. Saturated pixels count as the brightest. `radiance`: [h, w, 3] scene-linear, the box of
     `view`. `saturated`: [h, w] bool, or None. `level`: relative to the peak: pixels of the spot are brighter than it and than the noise of
     the ball, and connected to the peak. It is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
+    `still`: [h, w] what all frames show there, as `still_light` returns it; a spot of it is none of the lamp. Where another spot is as
+    bright, the direction is as unsure as both differ.
     Raises CalibrationError if there is no spot, it covers too much of the ball, or it is at the rim; the caller names the frame."""
     facing = (view.normal * view.to_viewer).sum(axis=-1)
     looked_at = view.inside & (facing > RIM_COSINE)
@@ -71,33 +84,64 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     clipped = looked_at & saturated if saturated is not None else np.zeros_like(looked_at)
     if clipped.any():
         value[clipped] = value.max()
-    peak = float(value.max())
-    floor = max(level * peak, _noise_ceiling(value[looked_at]))
-    rise = np.maximum(value - floor, 0)
-    spot, rival = _brightest(rise, value == peak)
-    count, ball_pixels = int(spot.sum()), int(view.inside.sum())
-    if count > max(MAX_SPOT_SHARE * ball_pixels, SMALL_SPOT):
-        raise CalibrationError(f"the bright spot covers {count / ball_pixels:.0%} of the ball: shorten the exposure or make the "
+    regions = _regions(value, looked_at, level)
+    rests = still is not None and float(np.minimum(still, value)[regions.spot].sum()) > STILL_SHARE * float(value[regions.spot].sum())
+    most = max(MAX_SPOT_SHARE * int(view.inside.sum()), SMALL_SPOT)
+    if rests:
+        assert still is not None  # for the type checker
+        moving, clipped = np.maximum(value - still, 0), clipped & np.isfinite(still)
+        try:
+            if moving.max() < LEAST_MOVING * value.max():
+                raise CalibrationError("no other spot is bright")
+            value, regions = moving, _regions(moving, looked_at, level)
+        except CalibrationError as error:
+            if int(regions.spot.sum()) <= most:
+                raise CalibrationError("the bright spot stands still in all frames, and there is no other: it is a light of the room, or "
+                                       "the same lamp shone in every frame") from error
+    count = int(regions.spot.sum())
+    if count > most:
+        raise CalibrationError(f"the bright spot covers {count / int(view.inside.sum()):.0%} of the ball: shorten the exposure or make the "
                                "light smaller")
-    weight = rise[spot] / rise[spot].sum()
-    rows, cols = np.nonzero(spot)
+    rows, cols = np.nonzero(regions.spot)
+    weight = regions.rise[regions.spot] / regions.rise[regions.spot].sum()
     uv = np.array([weight @ cols + view.box[1].start + 0.5, weight @ rows + view.box[0].start + 0.5])
-    cosine = float(weight @ facing[spot])
+    cosine = float(weight @ facing[regions.spot])
     if cosine < MIN_COSINE:
         degrees = math.degrees(math.acos(cosine))
         raise CalibrationError(f"the bright spot is at the rim of the ball, its normal {degrees:.0f}° off the line of sight: "
                                "the light is behind the object, or the ball's outline is too large")
+    direction, size = _seen_at(view, regions.spot, weight)
+    point = weight @ view.point[regions.spot]
+    outward = point - ball.centre
+    sure_to = _uncertainty_degrees(ball, cosine, count)
+    several = regions.share > RIVAL_SHARE
+    if several and value[regions.rival].max() > RIVAL_PEAK * value.max():
+        light = regions.rise[regions.rival]
+        other, _ = _seen_at(view, regions.rival, light / light.sum())
+        sure_to = math.hypot(sure_to, float(degrees_between(direction, other)) * math.sqrt(0.5))
+    flags = [("near the rim", cosine < NEAR_RIM_COSINE), ("several spots", several), ("another spot stands still", rests),
+             ("saturated", clipped[regions.spot].sum() > count / 2), ("small spot", count < SMALL_SPOT)]
+    return Spot(uv, direction, ball.centre + outward * ball.radius / np.linalg.norm(outward), size, sure_to, count,
+                tuple(name for name, raised in flags if raised))
+
+
+def _seen_at(view: BallView, spot: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the mean direction, [3], in which the pixels of a spot see, and their root mean square angle from it in degrees."""
     reflected = reflect(view.to_viewer[spot], view.normal[spot])
     mean = weight @ reflected
     direction = mean / np.linalg.norm(mean)
     off = np.arctan2(np.linalg.norm(np.cross(reflected, direction), axis=-1), reflected @ direction)
-    point = weight @ view.point[spot]
-    outward = point - ball.centre
-    flags = [("near the rim", cosine < NEAR_RIM_COSINE), ("several spots", rival > RIVAL_SHARE),
-             ("saturated", clipped[spot].sum() > count / 2), ("small spot", count < SMALL_SPOT)]
-    return Spot(uv, direction, ball.centre + outward * ball.radius / np.linalg.norm(outward),
-                math.degrees(math.sqrt(float(weight @ off**2))), _uncertainty_degrees(ball, cosine, count), count,
-                tuple(name for name, raised in flags if raised))
+    return direction, math.degrees(math.sqrt(float(weight @ off**2)))
+
+
+def still_light(radiances: Sequence[np.ndarray], saturated: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Return what all frames show on a ball, [h, w], infinite where all are saturated; None for two frames or fewer.
+    `radiances`: [h, w, 3] each. `saturated`: [h, w] bool each, or None."""
+    if len(radiances) < LEAST_FRAMES:
+        return None
+    least = np.min([radiance.mean(axis=-1, dtype=np.float64) for radiance in radiances], axis=0)
+    masks = [mask for mask in saturated if mask is not None]
+    return np.where(np.all(masks, axis=0), np.inf, least) if len(masks) == len(radiances) else least
 
 
 def reflect(to_viewer: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -123,12 +167,26 @@ def _noise_ceiling(values: np.ndarray) -> float:
     return median + PROMINENCE * spread
 
 
-def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the brightest connected region of `weight > 0` with a peak, and the light of the next region relative to its light."""
-    parts, count = label(weight > 0, np.ones((3, 3)))
-    light = np.bincount(parts.ravel(), weight.ravel(), minlength=count + 1)
-    best = int(max(np.unique(parts[peak]), key=lambda part: light[part]))
-    return parts == best, float(np.delete(light, best).max()) / float(light[best])
+class _Regions(NamedTuple):
+    """What is bright on a ball."""
+
+    rise: np.ndarray  # [h, w] above the level of the spot
+    spot: np.ndarray  # [h, w] bool, the brightest connected region with a peak
+    rival: np.ndarray  # [h, w] bool, the next region
+    share: float
+    """The light of the next region relative to that of the spot."""
+
+
+def _regions(value: np.ndarray, looked_at: np.ndarray, level: float) -> _Regions:
+    """Return the two brightest connected regions above `level` × the peak and the noise of the ball."""
+    peak = float(value.max())
+    rise = np.where(looked_at, np.maximum(value - max(level * peak, _noise_ceiling(value[looked_at])), 0), 0)
+    parts, count = label(rise > 0, np.ones((3, 3)))
+    light = np.bincount(parts.ravel(), rise.ravel(), minlength=count + 1)
+    best = int(max(np.unique(parts[value == peak]), key=lambda part: light[part]))
+    others = light.copy()
+    others[best] = 0
+    return _Regions(rise, parts == best, (parts == others.argmax()) & (rise > 0), float(others.max()) / float(light[best]))
 
 
 class Position(NamedTuple):
