@@ -21,7 +21,12 @@ STRENGTH_KEYS = ("intensity", "irradiance", "strength", "rgb", "colour", "color"
 LIST_KEYS = ("lights", "directions", "positions", "light_directions", "light_positions")
 MOST = 1e300
 """Numbers from here on are no lights; JSON has integers of any length."""
+NUMBER_KEYS = ("id", "index", "idx", "number", "num", "no", "no.", "nr", "nr.", "#", "n", "light", "led", "lamp", "frame")
+"""Headings of a column that numbers the lights."""
 COMMENTS = ("#", "%", "//")
+DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)")
+FLAT = 0.2
+"""The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles."""
 
 Run = str
 """True if lights are the `rows` or the `columns` of a table of numbers."""
@@ -122,11 +127,11 @@ def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
 def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
     """Return the headings of a text file in small letters, the number and the parts of each line, and the count in its first line."""
     lines = [(number, line) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
-    separator = next((mark for mark in (";", ",", "\t") if any(mark in line for _, line in lines)), None)
+    separator = next((mark for mark in (";", "\t", ",") if any(mark in line for _, line in lines)), None)
 
     def split(line: str) -> list[str]:
-        parts = line.split(separator) if separator else line.split()
-        return [part.strip().strip('"').strip("'") for part in parts]
+        parts = [part.strip().strip('"').strip("'") for part in (line.split(separator) if separator else line.split())]
+        return parts if separator == "," else [_with_point(part) for part in parts]
 
     rows = [(number, split(line)) for number, line in lines]
     count = None
@@ -136,6 +141,11 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
     if rows and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1]):
         headings, rows = [part.lower() for part in rows[0][1]], rows[1:]
     return headings, rows, count
+
+
+def _with_point(text: str) -> str:
+    """Return a number that has a decimal comma with a point, and any other text as it is."""
+    return DECIMAL_COMMA.sub(r"\1.\2", text) if DECIMAL_COMMA.fullmatch(text) else text
 
 
 def _number(text: str) -> float | None:
@@ -149,11 +159,45 @@ def _from_text(path: Path, run: Run | None) -> LightTable:
     headings, rows, count = _rows(path)
     if not rows:
         raise ManifestError(f"{path}: holds no light")
+    rows = _without_numbers(path, headings, rows)
     table = _without_headings(path, rows, run) if headings is None else _with_headings(path, headings, rows)
+    _check_angles(table)
     if count is not None and count != len(table.vectors):
         raise ManifestError(f"{path}: says {count} lights, holds {len(table.vectors)}")
     return _checked(table, (lambda index: f"{path}: line {rows[index][0]}") if table.run == "rows" else
                     (lambda index: f"{path}: column {index + 1}"))
+
+
+def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return rows without a first column that numbers the lights; under headings it stays, and is not read.
+    Raises ManifestError where a column numbers them in another order: nothing says whether images come in the order of rows or numbers."""
+    if headings is None:
+        columns = [0] if len(rows) > 3 and all(len(parts) == len(rows[0][1]) in (4, 5, 7) for _, parts in rows) else []
+    else:
+        named = any(heading in NAME_KEYS for heading in headings)
+        columns = [] if named else [index for index, heading in enumerate(headings) if heading in NUMBER_KEYS]
+    for column in columns:
+        texts = [parts[column] if column < len(parts) else "" for _, parts in rows]
+        numbers = [int(text) for text in texts if text.isdecimal() and len(text) < 7]
+        if len(numbers) < len(rows) or sorted(numbers) not in (list(range(len(rows))), list(range(1, len(rows) + 1))):
+            continue
+        if numbers != sorted(numbers):
+            raise ManifestError(f"{path}: numbers its lights {', '.join(texts[:4])} …: put the rows into the order of the images, or name "
+                                "the image of each light")
+        if headings is None:
+            return [(number, parts[1:]) for number, parts in rows]
+    return rows
+
+
+def _check_angles(table: LightTable) -> None:
+    """Refuse two angles beside a radius, as a table of vectors."""
+    for radius, angles in ((0, (1, 2)), (2, (0, 1))):
+        turn, height = np.abs(table.vectors[:, angles]).T
+        length = table.vectors[:, radius]
+        if (len(length) > 3 and np.ptp(length) == 0 and 90 < turn.max() <= 360 and height.max() <= 90
+                and length[0] < FLAT * float(np.median(np.hypot(turn, height)))):
+            raise ManifestError(f"{table.what}: its columns look like two angles and a radius of {length[0]:g}: there must be x, y and z "
+                                "of each light")
 
 
 def _with_headings(path: Path, headings: list[str], rows: list[tuple[int, list[str]]]) -> LightTable:

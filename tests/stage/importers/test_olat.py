@@ -47,6 +47,9 @@ TEXTS = {
     "semicolons.csv": "x;y;z\n" + rows(X, Y, Z, separator=";"),
     "named.csv": "Image,X,Y,Z\n" + rows(NAMES, X, Y, Z, separator=","),
     "other_order.csv": "\ufeffz,image,lx,ly\n" + rows(Z, [f"C:\\dome\\{name}" for name in NAMES], X, Y, separator=","),
+    "decimal_commas.csv": "Light;X;Y;Z\n" + rows(["L1", "L2", "L3", "L4"], X, Y, Z, separator=";").replace(".", ","),
+    "numbered.csv": "id,x,y,z\n" + rows(["1", "2", "3", "4"], X, Y, Z, separator=","),
+    "numbered.txt": rows(["0", "1", "2", "3"], X, Y, Z),
     "millimetres.csv": "file,x_mm,y_mm,z_mm\n" + rows(NAMES, *([1000 * value for value in column] for column in (X, Y, Z)), separator=","),
     "dome.lp": "4\n" + rows([name.replace(".JPG", ".tif") for name in NAMES], X, Y, Z),  # stems: the images were converted since
 }
@@ -149,6 +152,9 @@ def test_what_was_understood_is_told(folder):
     (rows(X[:2], Y[:2], Z[:2]), {}, r"2 lights, the folder 4 images \(IMG_2\.JPG to IMG_11\.JPG\)"),
     ("image,x,y,z\nno.jpg,0,0,1\n", {}, r"dirs\.txt: names no\.jpg, which is no image in the folder"),
     ("image,x,y,z\nIMG_2.JPG,0,0,1\nIMG_2.JPG,0,1,1\n", {}, r"names IMG_2\.JPG twice"),
+    ("id,x,y,z\n" + rows(["4", "2", "3", "1"], X, Y, Z, separator=","), {}, r"numbers its lights 4, 2, 3, 1"),
+    (rows(["4", "2", "3", "1"], X, Y, Z), {}, r"numbers its lights 4, 2, 3, 1"),
+    ("-120 40 1\n30 60 1\n95 12 1\n170 80 1\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
     ("", {}, r"dirs\.txt: holds no light"),
     (rows(X, Y, Z), {"axes": ("right", "left", "up")}, "two of them lie on one line"),
 ])
