@@ -17,6 +17,10 @@ PROBES = 4096
 """The number of directions in which lamps are looked for."""
 ONE_SIDED = 0.25
 """A rig without lamps near this part of the sphere is said to leave it dark."""
+ONE_PLACE_DEGREES = 0.1
+"""The angle between two lamps below which they stand in one direction, as measured places of two lamps never do."""
+FARTHEST_M = 100.0
+"""The distance of lamps from which places are said to be in another unit."""
 SIDE, LAMP = 720, 7
 """The side of the picture of a half of the dome, and the radius of a lamp in it, pixels."""
 
@@ -52,10 +56,28 @@ def check_rig(request: RigCheckRequest) -> RigCheck:
     if uncovered > ONE_SIDED:
         warnings.append(f"no lamp stands near {uncovered:.0%} of the sphere: light from there is moved to other lamps or left out "
                         "(relit drive --beyond)")
+    warnings += _places(rig)
     if request.picture is not None:
         _draw(rig, request.picture)
     return RigCheck(rig, dict(channels), dict(Counter(primary.name for _, primary in rig.emitters)), uncovered, tuple(patch_faults(rig)),
                     tuple(warnings))
+
+
+def _places(rig: Rig) -> list[str]:
+    """Say which lamps with the same primaries stand in one direction, and that all stand too far to be lamps."""
+    said = []
+    directions, subject = rig.directions, np.array(rig.subject_m)
+    near = np.arccos(np.clip(directions @ directions.T, -1, 1)) < np.radians(ONE_PLACE_DEGREES)
+    names = [{primary.name for primary in lamp.primaries} for lamp in rig.lights]
+    pairs = [(one, other) for one, other in zip(*np.nonzero(np.triu(near, 1)), strict=True) if names[one] & names[other]]
+    if pairs:
+        one, other = pairs[0]
+        said.append(f"lights: {rig.lights[one].name} and {rig.lights[other].name} stand in one direction"
+                    + (f", and {len(pairs) - 1} more pairs" if len(pairs) > 1 else "") + ": a place that was copied?")
+    places = [lamp.position_m for lamp in rig.lights if lamp.position_m is not None]
+    if places and (distance := float(np.median(np.linalg.norm(np.array(places) - subject, axis=1)))) > FARTHEST_M:
+        said.append(f"lights[].position_m: the lamps stand {distance:.3g} m from the subject (median): are the places millimetres?")
+    return said
 
 
 def _draw(rig: Rig, path: Path) -> None:

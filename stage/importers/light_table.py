@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stage.errors import ManifestError
+from stage.formats.csv_table import with_point
 from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import first_of, read_json, read_lines
 from stage.model import name_fault
@@ -24,7 +25,6 @@ MOST = 1e300
 NUMBER_KEYS = ("id", "index", "idx", "number", "num", "no", "no.", "nr", "nr.", "#", "n", "light", "led", "lamp", "frame")
 """Headings of a column that numbers the lights."""
 COMMENTS = ("#", "%", "//")
-DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)")
 FLAT = 0.2
 """The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles."""
 
@@ -131,7 +131,7 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
 
     def split(line: str) -> list[str]:
         parts = [part.strip().strip('"').strip("'") for part in (line.split(separator) if separator else line.split())]
-        return parts if separator == "," else [_with_point(part) for part in parts]
+        return parts if separator == "," else [with_point(part) for part in parts]
 
     rows = [(number, split(line)) for number, line in lines]
     count = None
@@ -141,11 +141,6 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
     if rows and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1]):
         headings, rows = [part.lower() for part in rows[0][1]], rows[1:]
     return headings, rows, count
-
-
-def _with_point(text: str) -> str:
-    """Return a number that has a decimal comma with a point, and any other text as it is."""
-    return DECIMAL_COMMA.sub(r"\1.\2", text) if DECIMAL_COMMA.fullmatch(text) else text
 
 
 def _number(text: str) -> float | None:

@@ -72,6 +72,21 @@ def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
     assert not (tmp_path / "rig.json").exists()
 
 
+@pytest.mark.parametrize("table", ["name;x;y;z\nA;0;0;1\nB;0,6;0;0,8\n", "Name\tX\tY\tZ\nA\t0\t0\t1\nB\t0.6\t0\t0.8\n"],
+                         ids=["semicolons", "tabs"])
+def test_a_table_may_have_decimal_commas(relit, tmp_path, table):
+    (tmp_path / "dome.csv").write_text(table)
+    relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json")
+    assert json.loads((tmp_path / "rig.json").read_text())["lights"][1]["direction"] == pytest.approx([0.6, 0, 0.8])
+
+
+def test_lamps_of_one_place_and_places_in_millimetres_are_said(relit, tmp_path):
+    (tmp_path / "dome.csv").write_text("name,x,y,z\nA,0,0,1500\nB,900,0,1200\nC,900,0,1200\n")
+    relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json", "--places")
+    shown = relit.done("rig", "check", tmp_path / "rig.json").out
+    assert "B and C stand in one direction" in shown and "lights[].position_m: the lamps stand 1.5e+03 m" in shown
+
+
 def test_more_lamps_plan_a_smaller_error(relit, tmp_path):
     write_sky(tmp_path / "sky.exr", "sun", rows=32)
     write_rig(tmp_path / "rig.json", fibonacci_sphere(64), name='the "new" dome')
