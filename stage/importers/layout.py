@@ -57,6 +57,17 @@ def image_names(folder: Path) -> list[str]:
                              if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
 
 
+def image_named(given: str, names: Sequence[str]) -> str | None:
+    """Return which of the images of a folder a table means, None where it means none: the one of its name, whatever folder stands before
+    it, or else the only one of its stem, for images are converted, and written in small or capital letters."""
+    last = given.replace("\\", "/").rsplit("/", 1)[-1]
+    if last in names:
+        return last
+    stem = Path(last).stem.lower()
+    alike = [name for name in names if Path(name).stem.lower() in (stem, last.lower())]
+    return alike[0] if len(alike) == 1 else None
+
+
 def read_lines(path: Path) -> list[tuple[int, str]]:
     """Return the lines of a text file that are not blank, without white space around them, each with its number from 1."""
     text = inputs.read_bytes(path).decode("utf-8-sig", "replace")

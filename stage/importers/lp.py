@@ -14,7 +14,16 @@ from stage import inputs
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import View
-from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, light_scale, read_lines, write_capture
+from stage.importers.layout import (
+    assumed_encoding,
+    color_space_of,
+    image_named,
+    image_names,
+    image_resolution,
+    light_scale,
+    read_lines,
+    write_capture,
+)
 from stage.model import name_fault
 
 
@@ -32,7 +41,8 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     if count != len(rows):
         raise ManifestError(f"{path}: says {count} images, holds {len(rows)}")
     scale, irradiance = light_scale(white)
-    frames = [_frame(path, folder, number, row, irradiance) for number, row in rows]
+    beside = image_names(folder)
+    frames = [_frame(path, folder, beside, number, row, irradiance) for number, row in rows]
     if not frames:
         raise ManifestError(f"{path}: names no image")
     first = folder / frames[0]["image"]
@@ -60,7 +70,7 @@ def _find(source: Path) -> Path:
     return found[0]
 
 
-def _frame(path: Path, folder: Path, number: int, row: str, irradiance: float) -> dict[str, Any]:
+def _frame(path: Path, folder: Path, beside: list[str], number: int, row: str, irradiance: float) -> dict[str, Any]:
     parts = row.rsplit(maxsplit=3)  # a name may hold spaces
     try:
         direction = [float(part) for part in parts[1:]]
@@ -72,8 +82,9 @@ def _frame(path: Path, folder: Path, number: int, row: str, irradiance: float) -
         raise ManifestError(f"{path}: line {number}: the light direction has zero length")
     if (fault := name_fault(parts[0])) is not None:
         raise ManifestError(f"{path}: line {number}: the image name {fault}")
-    # names often hold folders of the machine that made the file, while the images lie beside the file
+    # names often hold folders of the machine that made the file, while the images lie beside the file, converted since
     name = parts[0].replace("\\", "/")
     with storage("read", folder / name):  # a name that is too long is an error of the file system
-        relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else name.rsplit("/", 1)[-1]
+        relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else (
+            image_named(name, beside) or name.rsplit("/", 1)[-1])
     return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [irradiance] * 3}}

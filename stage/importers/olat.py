@@ -16,7 +16,16 @@ from stage.capture.manifest import FILE_NAME
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
-from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, light_scale, natural_order, write_capture
+from stage.importers.layout import (
+    Imported,
+    assumed_encoding,
+    color_space_of,
+    image_named,
+    image_resolution,
+    light_scale,
+    natural_order,
+    write_capture,
+)
 from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
 
@@ -141,13 +150,9 @@ def match(path: Path, table: LightTable, chosen: Selected) -> tuple[list[str], s
             raise ManifestError(f"{path}: has {len(table.vectors)} lights, the folder {len(chosen.frames)} images "
                                 f"({chosen.frames[0]} to {chosen.frames[-1]}): choose as many with --images")
         return list(chosen.frames), f"in the order of the images, {chosen.frames[0]} to {chosen.frames[-1]}"
-    known = {name: name for name in chosen.frames}
-    known |= {Path(name).stem.lower(): name for name in chosen.frames if sum(Path(n).stem.lower() == Path(name).stem.lower()
-                                                                            for n in chosen.frames) == 1}
     names = []
     for given in table.names:
-        last = given.replace("\\", "/").rsplit("/", 1)[-1]
-        found = known.get(last) or known.get(Path(last).stem.lower()) or known.get(last.lower())
+        found = image_named(given, chosen.frames)
         if found is None:
             raise ManifestError(f"{path}: names {given}, which is no image in the folder")
         names.append(found)

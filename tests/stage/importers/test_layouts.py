@@ -143,6 +143,14 @@ def test_an_rti_capture_with_a_space_in_a_name(tmp_path):
     assert (capture.name, capture.camera.resolution) == ("dome", (5, 4))
 
 
+def test_images_that_were_converted_since_are_found_by_their_stems(tmp_path):
+    lines = [line.replace(".jpg", ".TIF").replace(".png", ".TIF") for line in GOOD]
+    assert lines != GOOD
+    folder = rti(tmp_path, lines)
+    manifest = Capture.open(lp.import_folder(folder, tmp_path).parent).manifest
+    assert all((folder / frame.image).is_file() for frame in manifest.frames)
+
+
 def test_the_lp_file_itself_may_be_named(tmp_path):
     rti(tmp_path / "a", GOOD)
     shutil.copy(tmp_path / "a" / "dome.lp", tmp_path / "a" / "second.lp")
