@@ -34,9 +34,9 @@ RAYS = 360
 """The radii along which the outline is looked for."""
 REACH = 0.12
 """The outline lies within this part of the radius of the proposed circle."""
-SMOOTH_PX, SMOOTH_RAYS = 4.0, 2.0
-"""The standard deviation, in pixels, of the mean that is taken off before steps are looked for, and that in radii of the mean along the
-outline."""
+SMOOTH_PART, SMOOTH_RAYS = .1, 2.0
+"""The standard deviations of means: over this part of the radius across the outline, which is taken off before steps are looked for, and
+over so many radii along it."""
 STEP_PX = 0.25
 """The distance of samples along a radius."""
 ERROR_PX = 1.0
@@ -72,11 +72,12 @@ def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutli
     """Find round outlines, the most complete and largest first.
     `pictures`: [rows, cols] each, 0 to 1, in which outlines stand still: the mean and the brightest of all frames."""
     found: list[RoundOutline] = []
+    blurred = _blurred(pictures)
     for picture in pictures:
         for u, v, radius in _proposals(picture):
             if any(_near(camera, other.ball, u, v, radius) for other in found):
                 continue
-            outline = _examine(camera, pictures, u, v, radius)
+            outline = _examine(camera, blurred, u, v, radius)
             if outline is not None:
                 found.append(outline)
     found.sort(key=lambda one: one.share * one.ball.radius_px, reverse=True)
@@ -89,7 +90,12 @@ def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutli
 
 def outline_near(camera: Camera, pictures: list[np.ndarray], ball: Ball) -> RoundOutline | None:
     """Return the outline that images show near a ball that was named, None where they show none."""
-    return _examine(camera, pictures, *project(camera, ball.centre), ball.radius_px)
+    return _examine(camera, _blurred(pictures), *project(camera, ball.centre), ball.radius_px)
+
+
+def _blurred(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """Return pictures, [rows, cols] float32 each, blurred by a pixel, so that noise has few steps."""
+    return [np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.0)) for picture in pictures]
 
 
 def _proposals(picture: np.ndarray) -> list[tuple[float, float, float]]:
@@ -105,30 +111,31 @@ def _proposals(picture: np.ndarray) -> list[tuple[float, float, float]]:
     return [((u + 0.5) / scale, (v + 0.5) / scale, radius / scale) for u, v, radius in best]
 
 
-def _examine(camera: Camera, pictures: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
-    """Return the outline of a ball near a circle, or None where too few steps of brightness lie on one."""
-    first = _outline_about(camera, pictures, u, v, radius)
+def _examine(camera: Camera, blurred: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
+    """Return the outline of a ball near a circle, or None where too few steps of brightness lie on one.
+    `blurred`: the pictures, by a pixel."""
+    first = _outline_about(camera, blurred, u, v, radius)
     if first is None:
         return None
     # radii of the outline itself cross it at a right angle, so that means along it are sharp
     (u, v), radius = fit_circle(first.points)
-    return _outline_about(camera, pictures, u, v, radius) or first
+    return _outline_about(camera, blurred, u, v, radius) or first
 
 
-def _outline_about(camera: Camera, pictures: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
+def _outline_about(camera: Camera, blurred: list[np.ndarray], u: float, v: float, radius: float) -> RoundOutline | None:
     """Return the outline with most of the radii of a circle."""
     turn = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)[:, None]
     along = np.arange(radius * (1 - REACH) - 2, radius * (1 + REACH) + 2, STEP_PX)
     at_u, at_v = u + along * np.cos(turn), v + along * np.sin(turn)
     best: RoundOutline | None = None
-    for picture in pictures:
+    for picture in blurred:
         rows, cols = picture.shape
-        # what changes over many pixels is what the ball shows, and no outline
-        single = picture.astype(np.float32)
-        sharp = cv2.GaussianBlur(single, (0, 0), 1.0) - cv2.GaussianBlur(single, (0, 0), SMOOTH_PX)
-        values = cv2.remap(sharp, (at_u - 0.5).astype(np.float32), (at_v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
+        values = cv2.remap(picture, (at_u - 0.5).astype(np.float32), (at_v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
                            borderMode=cv2.BORDER_REPLICATE)
-        slope = np.abs(np.gradient(gaussian_filter1d(values.astype(np.float64), SMOOTH_RAYS, axis=0, mode="wrap"), axis=1))
+        along_it = gaussian_filter1d(values.astype(np.float64), SMOOTH_RAYS, axis=0, mode="wrap")
+        # what changes over many pixels is what the ball shows, and no outline
+        sharp = along_it - gaussian_filter1d(along_it, SMOOTH_PART * radius / STEP_PX, axis=1, mode="nearest")
+        slope = np.abs(np.gradient(sharp, axis=1))
         slope[(at_u < 1) | (at_u > cols - 1) | (at_v < 1) | (at_v > rows - 1)] = 0
         ray, distance = _steps(slope, along)
         if len(np.unique(ray)) < LEAST_SHARE * RAYS:
