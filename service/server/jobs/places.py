@@ -1,5 +1,7 @@
 """Find the files that a job reads and writes: captures, environments and results of other jobs, as folders of this machine."""
 
+import re
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -136,7 +138,7 @@ def without_places(text: str, job: str, context: WorkerContext) -> str:
             names[row["folder"]] = row["id"] if row["kind"] == CAPTURE else Path(row["folder"]).name
     for place in sorted(names, key=len, reverse=True):
         text = text.replace(place, names[place])
-    return text
+    return re.sub(rf"{re.escape(tempfile.gettempdir())}/relit-[^/\s]+/", "", text)  # folders that a step made of links to results
 
 
 def _named(place: Path, identifier: str) -> Path:
