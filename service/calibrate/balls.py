@@ -109,10 +109,9 @@ def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]
                                 f"--ball-radius-m says {radius:.4g}")
 
 
-def still_on(captures: LightCaptures, views: Sequence[BallView]) -> list[np.ndarray | None]:
+def still_on(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[np.ndarray | None]:
     """Return what up to 16 frames of a capture all show on each ball, [h, w] in the box of its view; None for two frames or fewer."""
-    seen = _seen_in(captures, views)
-    return [still_light([each.radiance for each in frames], [each.saturated for each in frames]) for frames in seen]
+    return [_still(frames) for frames in _seen_in(captures, correction, views)]
 
 
 def ball_entry(ball: Ball) -> dict[str, Any]:
@@ -164,7 +163,7 @@ class _Found(NamedTuple):
 def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> _Found:
     def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
         places = []
-        still = still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
+        still = _still(frames)
         for seen in frames:
             try:
                 places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level, still=still).uv)
@@ -205,7 +204,7 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
     outlines = find_outlines(camera, pictures)[:CANDIDATES]
     placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
     views = [view_ball(ball, camera) for _, ball in placed]
-    seen = _seen_in(captures, views)
+    seen = _seen_in(captures, correction, views)
     balls: list[Ball] = []
     for (_, ball), view, frames in zip(placed, views, seen, strict=True):
         if brightest[view.box][view.inside].max(initial=0) < DARK or any(_overlap(camera, ball, other) for other in balls):
@@ -215,9 +214,12 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
     return _Found(balls, len(outlines))
 
 
-def _seen_in(captures: LightCaptures, views: Sequence[BallView]) -> list[list[_Seen]]:
+def _still(frames: Sequence[_Seen]) -> np.ndarray | None:
+    return still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
+
+
+def _seen_in(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[list[_Seen]]:
     """Return the pixels of up to 16 frames within each outline."""
-    correction = Correction.of(captures.source)
     seen: list[list[_Seen]] = [[] for _ in views]
     for number in evenly(len(captures.lit), FRAMES):
         lit = captures.lit[number]

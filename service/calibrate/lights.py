@@ -82,7 +82,7 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
         row = (three_numbers(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
         return MeasuredLight(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
 
-    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, still_on(captures, [view])),
+    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=True),
                                  drop_failed=request.drop_failed)
     results = _with_wide_spots(results)
     timings.close()
@@ -132,7 +132,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         row = (three_numbers(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
         return MeasuredLight(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
 
-    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings, still_on(captures, views)),
+    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings, mirrors=True),
                                  drop_failed=request.drop_failed)
     timings.close()
     missed = sum(MISSES in result.entry["flags"] for result in results)
@@ -199,7 +199,8 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
         entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels, "flags": flags}
         return MeasuredLight(with_brightness(light, scale), entry, (), found.residual)
 
-    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=False),
+                                 drop_failed=request.drop_failed)
     timings.close()
     return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
                         headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None,
@@ -208,9 +209,11 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],
                   measure: Callable[[LitFrame, Sequence[BallPixels]], MeasuredLight],
-                  timings: Timings, still: Sequence[np.ndarray | None] = (None,)) -> list[MeasuredLight | CalibrationError]:
-    """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured."""
+                  timings: Timings, *, mirrors: bool) -> list[MeasuredLight | CalibrationError]:
+    """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured.
+    `mirrors`: whether the balls show the room, of which the patches then say what stands still."""
     correction = Correction.of(captures.source)
+    still = still_on(captures, correction, views) if mirrors else [None] * len(views)
 
     def one(lit: LitFrame) -> MeasuredLight | CalibrationError:
         radiance = correction.apply(lit.frame)

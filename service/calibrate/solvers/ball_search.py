@@ -34,7 +34,7 @@ RAYS = 360
 """The radii along which the outline is looked for."""
 REACH = 0.12
 """The outline lies within this part of the radius of the proposed circle."""
-SMOOTH_PART, SMOOTH_RAYS = .1, 2.0
+SMOOTH_PART, SMOOTH_RAYS = 0.1, 2.0
 """The standard deviations of means: over this part of the radius across the outline, which is taken off before steps are looked for, and
 over so many radii along it."""
 STEP_PX = 0.25

@@ -87,17 +87,14 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     regions = _regions(value, looked_at, level)
     rests = still is not None and float(np.minimum(still, value)[regions.spot].sum()) > STILL_SHARE * float(value[regions.spot].sum())
     most = max(MAX_SPOT_SHARE * int(view.inside.sum()), SMALL_SPOT)
-    if rests:
-        assert still is not None  # for the type checker
+    if still is not None and rests:
         moving, clipped = np.maximum(value - still, 0), clipped & np.isfinite(still)
-        try:
-            if moving.max() < LEAST_MOVING * value.max():
-                raise CalibrationError("no other spot is bright")
-            value, regions = moving, _regions(moving, looked_at, level)
-        except CalibrationError as error:
-            if int(regions.spot.sum()) <= most:
-                raise CalibrationError("the bright spot stands still in all frames, and there is no other: it is a light of the room, or "
-                                       "the same lamp shone in every frame") from error
+        other = _regions_of_another(moving, looked_at, level, least=LEAST_MOVING * float(value.max()))
+        if other is not None:
+            value, regions = moving, other
+        elif int(regions.spot.sum()) <= most:
+            raise CalibrationError("the bright spot stands still in all frames, and there is no other: it is a light of the room, or "
+                                   "the same lamp shone in every frame")
     count = int(regions.spot.sum())
     if count > most:
         raise CalibrationError(f"the bright spot covers {count / int(view.inside.sum()):.0%} of the ball: shorten the exposure or make the "
@@ -117,8 +114,8 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     several = regions.share > RIVAL_SHARE
     if several and value[regions.rival].max() > RIVAL_PEAK * value.max():
         light = regions.rise[regions.rival]
-        other, _ = _seen_at(view, regions.rival, light / light.sum())
-        sure_to = math.hypot(sure_to, float(degrees_between(direction, other)) * math.sqrt(0.5))
+        rival, _ = _seen_at(view, regions.rival, light / light.sum())
+        sure_to = math.hypot(sure_to, float(degrees_between(direction, rival)) * math.sqrt(0.5))
     flags = [("near the rim", cosine < NEAR_RIM_COSINE), ("several spots", several), ("another spot stands still", rests),
              ("saturated", clipped[regions.spot].sum() > count / 2), ("small spot", count < SMALL_SPOT)]
     return Spot(uv, direction, ball.centre + outward * ball.radius / np.linalg.norm(outward), size, sure_to, count,
@@ -187,6 +184,14 @@ def _regions(value: np.ndarray, looked_at: np.ndarray, level: float) -> _Regions
     others = light.copy()
     others[best] = 0
     return _Regions(rise, parts == best, (parts == others.argmax()) & (rise > 0), float(others.max()) / float(light[best]))
+
+
+def _regions_of_another(moving: np.ndarray, looked_at: np.ndarray, level: float, least: float) -> _Regions | None:
+    """Return what is bright on a ball beside what stands still, None where no peak of at least `least` is."""
+    try:
+        return _regions(moving, looked_at, level) if moving.max() >= least else None
+    except CalibrationError:
+        return None
 
 
 class Position(NamedTuple):

@@ -62,7 +62,7 @@ def measured(folder, circles=NAMED):
 @pytest.mark.parametrize("room", [lamp(WINDOW, 12.0, 0.6), lamp(WINDOW, 12.0, 5.0), lamp(WINDOW, 3.0, 5.0)],
                          ids=["window", "saturated window", "lamp of the room"])
 def test_a_light_of_the_room_is_not_the_lamp(tmp_path, room):
-    """It is brighter or larger than the lamp, and stands still from frame to frame. A pixel of the ball is 2° of reflection."""
+    """A light of the room is brighter or larger than the lamp, and stands still from frame to frame; a pixel is 2° of reflection."""
     errors, _, flags = measured(write(tmp_path / "ball", [image((lamp(d, radiance=3.0), room)) for d in DIRECTIONS]))
     assert errors.max() < 1.0
     assert room[2] < 3.0 or all("another spot stands still" in each for each in flags)
