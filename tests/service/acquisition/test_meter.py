@@ -78,6 +78,7 @@ def test_the_proposed_exposure_clips_less_than_a_thousandth_and_no_third_of_a_st
     assert written["proposed"]["exposure_s"] == found.exposure_s and len(written["readings"]) == LAMPS and sum(written["histogram"]) > 0
 
 
+@pytest.mark.long
 def test_clipped_pixels_have_stripes(tmp_path, stage):
     with controller(tmp_path, stage) as (rig, _):
         red = []

@@ -45,6 +45,7 @@ def test_what_a_whole_board_deviates_by_is_told_with_its_size(fault, name, value
     assert len(found.sentences()) == 1
 
 
+@pytest.mark.long
 def test_prints_whose_pads_differ_share_nothing():
     """Thirty prints whose pads are 3 % thicker or thinner each."""
     grid = BoardGrid(PRINT_PIXEL, -COLS / 2 * PRINT_PIXEL, ROWS / 2 * PRINT_PIXEL, ROWS, COLS)
@@ -68,13 +69,14 @@ def inspected(relit, folder, views: list, *, sigma: float = SIGMA) -> dict:
     return json.loads((folder / "board" / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize("seed", [7, 55])
+@pytest.mark.parametrize("seed", [7, pytest.param(55, marks=pytest.mark.long)])
 def test_a_good_board_of_vertical_walls_has_no_defect(relit, tmp_path, seed):
     """Tiles that walls alone place, of which 13 in 18 such boards had defects beside them."""
     walls = components(2.4e-3, 2.2e-3, seed=seed, count=16)
     assert inspected(relit, tmp_path, [scan(walls, **STATION, seed=seed + k) for k in (0, 1)])["defects"] == []
 
 
+@pytest.mark.long
 def test_a_good_board_has_no_defect_where_noise_hides_its_slopes(relit, tmp_path):
     """Domes of 60 µm under noise of 10: tiles lie where the stage says, to 2 pixels, and slopes below the noise of a pixel count."""
     bumps = domes(2.4e-3, 2.2e-3, seed=4)

@@ -155,6 +155,7 @@ def test_two_chrome_balls_are_found_and_give_positions(tmp_path):
     assert (error < 3 * sigma).all()
 
 
+@pytest.mark.long
 def test_one_ball_does_not_place_lights(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", chrome)
     before = files_in(folder)

@@ -244,6 +244,7 @@ def test_a_service_that_is_not_there_is_said_before_a_lamp_is_on(capture, stage,
     assert stage.released == 0
 
 
+@pytest.mark.long
 def test_a_service_that_is_lost_ends_no_capture(capture, stage, tmp_path, client, monkeypatch):
     """All pictures are taken; the sentence says what is left, and the same command sends it."""
     between = Between()

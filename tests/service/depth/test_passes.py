@@ -26,8 +26,10 @@ def test_passes_of_a_right_scan_lie_within_its_noise(tmp_path, right):
 
 
 @pytest.mark.parametrize(("wrong", "words"), [
-    ({"inverted": True}, "the poses are platform_from_world"), ({"factors": (1, -1, 1, 1, 1)}, "azimuth_rad has the other sign"),
-    ({"factors": (1, 1, -1, 1, 1)}, "elevation_rad has the other sign"), ({"factors": (1, 1, 1, 1000, 1)}, "range_m is in millimetres"),
+    ({"inverted": True}, "the poses are platform_from_world"),
+    *(pytest.param({"factors": factors}, words, marks=pytest.mark.long) for factors, words in (
+        ((1, -1, 1, 1, 1), "azimuth_rad has the other sign"), ((1, 1, -1, 1, 1), "elevation_rad has the other sign"),
+        ((1, 1, 1, 1000, 1), "range_m is in millimetres"))),
 ], ids=["poses", "azimuth", "elevation", "millimetres"])
 def test_another_sign_unit_or_sense_is_named(tmp_path, wrong, words):
     (warning,), passes = scanned(write_scan(tmp_path, **wrong))
@@ -35,8 +37,9 @@ def test_another_sign_unit_or_sense_is_named(tmp_path, wrong, words):
 
 
 @pytest.mark.parametrize(("wrong", "pattern", "size"), [
-    ({"late_s": -0.2}, r"if ([0-9.]+) s are taken off time_s", 0.2), ({"late_s": 0.1}, r"if ([0-9.]+) s are added to time_s", 0.1),
-    ({"turned": 2.0}, r"platform_from_scanner is turned by ([0-9.]+)°", 2.0),
+    pytest.param({"late_s": -0.2}, r"if ([0-9.]+) s are taken off time_s", 0.2, marks=pytest.mark.long),
+    ({"late_s": 0.1}, r"if ([0-9.]+) s are added to time_s", 0.1),
+    pytest.param({"turned": 2.0}, r"platform_from_scanner is turned by ([0-9.]+)°", 2.0, marks=pytest.mark.long),
 ], ids=["clock early", "clock late", "mounting"])
 def test_a_clock_or_a_mounting_that_is_off_is_measured(tmp_path, wrong, pattern, size):
     """To a twentieth: by some thousand places with a noise of 1 cm, which the fault moves by several."""

@@ -34,7 +34,7 @@ def without(folder):
     edit_manifest(folder, frames=[frame for index, frame in enumerate(frames) if index not in UNLIT])
 
 
-@pytest.mark.parametrize("method", ["lambert", "robust", "svbrdf"])
+@pytest.mark.parametrize("method", ["lambert", *(pytest.param(name, marks=pytest.mark.long) for name in ("robust", "svbrdf"))])
 def test_a_solve_leaves_out_what_a_person_would(tmp_path, method):
     write_capture(tmp_path, SCENE)
     names = put_out(tmp_path, SCENE.images.max())
@@ -46,6 +46,7 @@ def test_a_solve_leaves_out_what_a_person_would(tmp_path, method):
     assert np.array_equal(found.maps.normal, taken_out.maps.normal) and np.array_equal(found.maps.sigma, taken_out.maps.sigma)
 
 
+@pytest.mark.long
 def test_near_lamps(tmp_path):
     dome = near_lights.dome(32)
     capture = near_lights.write(tmp_path / "capture", dome, near_lights.lamps(dome, 12, 3))

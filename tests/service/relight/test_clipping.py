@@ -107,6 +107,7 @@ def test_basis_of_brackets_holds_whole_readings(relit, capture):
     assert SURFACE.off(brightest, image) < 0.01 or image.max() < 0.01
 
 
+@pytest.mark.long
 def test_solving_brackets_is_solving_whole_frames(relit, capture):
     """Each light counts once, with its merged reading; to the half rounding of the images."""
     def solve(name):

@@ -26,6 +26,7 @@ def errors(relit, folder, subject, *arguments) -> np.ndarray:
     return angles_degrees(maps.normal, subject.normal(0))[inner & maps.estimated]
 
 
+@pytest.mark.long
 def test_aligned_normals_are_close_to_those_of_a_subject_that_stands_still(relit, tmp_path):
     write_moving(tmp_path, TURNING)
     found = errors(relit, tmp_path, TURNING, "--align")
@@ -34,6 +35,7 @@ def test_aligned_normals_are_close_to_those_of_a_subject_that_stands_still(relit
     assert np.median(errors(relit, tmp_path, TURNING)) > 10 * np.median(found)
 
 
+@pytest.mark.long
 def test_a_subject_that_stands_still_loses_nothing(relit, tmp_path):
     write_moving(tmp_path, Subject())
     found = errors(relit, tmp_path, Subject(), "--align")

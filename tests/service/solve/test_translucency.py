@@ -33,7 +33,7 @@ def test_normals_of_translucent_bodies_are_as_unsure_as_they_are_wrong(tmp_path,
 
 @pytest.mark.parametrize("body", [Body(), Body(lens_px=0.9), Body(bounced=(0.3, 0.2, 0.1)), Body(lens_px=0.6, bounced=(0.4, 0.2, 0.05))],
                          ids=["sharp", "blurred by the lens", "in bounced light", "both"])
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
 def test_opaque_bodies_are_not_taken_for_translucent_ones(tmp_path, body, seed):
     assert "translucent" not in solved(tmp_path, body, seed=seed)[1]
 
@@ -45,6 +45,7 @@ def test_noise_makes_no_sharp_edges_of_the_darker_colour(tmp_path, body, noise):
     assert "translucent" not in solved(tmp_path, body, noise=noise, seed=1)[1]
 
 
+@pytest.mark.long
 def test_jpegs_are_not_judged(tmp_path):
     """Their colours are stored at half the resolution, and dark ones coarsely."""
     body = Body(albedo=(0.6, 0.3, 0.08), lengths=(1.0, 0.7, 0.5))

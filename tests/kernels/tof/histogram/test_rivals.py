@@ -90,6 +90,7 @@ def test_pulses_are_counted_from_the_histograms(device):
     assert found.used > 0.5
 
 
+@pytest.mark.long
 def test_counts_that_are_no_whole_numbers_are_rounded_before_they_are_summed_up(device):
     """As in histograms that were divided by their highest bin: sums of rounded bins are larger than rounded sums."""
     counts = tof.histogram(tof.room(24, 32), 3000, background=1.0, seed=7, pulses=800).reshape(-1, BINS)

@@ -169,6 +169,7 @@ def places_off(views: list[View], stitched) -> tuple[np.ndarray, np.ndarray]:
     return left.reshape(-1, 2) / PIXEL, np.array(sigma) / PIXEL
 
 
+@pytest.mark.long
 def test_vertical_walls_place_tiles_to_a_part_of_a_pixel_and_sigma_says_it():
     """A wall between two points may be anywhere between them, along all of its straight part. Before its error counted, half of the tiles
     lay 8 σ off and more; the bounds leave half as much again as 40 such boards have (median .66, 95th percentile 3)."""

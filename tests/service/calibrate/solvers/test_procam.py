@@ -182,6 +182,7 @@ def depth_error(camera, projector, place):
     return 1 / inverse / -points[:, 2] - 1
 
 
+@pytest.mark.long
 def test_how_sure_depths_are_is_told():
     """Over 40 calibrations the errors are as large as σ says: their mean square has a spread of a quarter, as they share one error."""
     ratios = []
@@ -193,7 +194,8 @@ def test_how_sure_depths_are_is_told():
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.5 and max(ratios) < 4
 
 
-@pytest.mark.parametrize(("count", "most"), [(3, 0.05), (8, 0.01), (20, 0.0)])
+@pytest.mark.parametrize(("count", "most"), [
+    (3, 0.05), *(pytest.param(*more, marks=pytest.mark.long) for more in ((8, 0.01), (20, 0.0)))])
 def test_boards_that_lie_alike_are_refused(count, most):
     """They fit to a tenth of a pixel, with focal lengths that are wrong by up to five times."""
     frames = list(tilted(count, most, 1))

@@ -60,6 +60,7 @@ def test_other_matter(relit, tmp_path, light, name, scattered, scatter_px, fligh
     assert said and np.median(off) < 1.4 and (off > 5).mean() < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "world"), [("waves", {"blur_px": 1.5}), *(
     pytest.param(name, world, marks=pytest.mark.long) for name in PATTERNS for world in (
         {}, {"blur_px": 2.0}, {"light": 0.3}, {"read_noise": 0.006, "electrons": 2500.0}))])

@@ -17,7 +17,8 @@ WORLD = World(shapes=(Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ba
 PATTERNS = {"Gray with inverses": binary_patterns(256, "column"), "Gray": binary_patterns(256, "column", inverses=False),
             "binary": binary_patterns(256, "column", code="binary"), "3-ary": kary_patterns(256, "column", base=3),
             "Gray rows": binary_patterns(192, "row", inverses=False)}
-every_code = pytest.mark.parametrize("name", PATTERNS)
+every_code = pytest.mark.parametrize("name", ["Gray", "Gray rows", *(pytest.param(name, marks=pytest.mark.long) for name in (
+    "Gray with inverses", "binary", "3-ary"))])
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_a_camera_that_drifts_is_named_and_sigma_holds_it(tmp_path, light, name)
     assert (off > 5).mean() < 0.005
 
 
-@pytest.mark.parametrize("name", ["Gray with inverses", "Gray"])
+@pytest.mark.parametrize("name", [pytest.param("Gray with inverses", marks=pytest.mark.long), "Gray"])
 def test_a_camera_that_shakes_is_named_and_sigma_holds_it(tmp_path, light, name):
     rng = np.random.default_rng(2)
     said, size, off = measured(tmp_path, light, name, lambda part: rng.normal(0, 0.5))

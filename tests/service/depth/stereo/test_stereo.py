@@ -80,6 +80,7 @@ def test_half_hidden_places_are_refused(relit, tmp_path):
     assert (maps.status[hidden] == Status.OCCLUDED).mean() > 0.6
 
 
+@pytest.mark.long
 def test_a_regular_grid_of_dots_is_refused(relit, tmp_path):
     parts, grid = list(PARTS["plane and sphere"]), [scenes.grid_of_dots(9)]
     left, right = scenes.render(parts, grid, side=2), scenes.render(parts, grid, OTHER, POSE, side=2)
@@ -235,7 +236,7 @@ def test_images_without_texture_are_refused_with_a_sentence(relit, tmp_path):
     assert outcome.code == 2 and "show no texture that both see" in outcome.err
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.long), True])
 def test_images_of_other_moments_give_no_depth(relit, tmp_path, mirrored):
     """One pixel in a hundred matches by chance, where the range of depths is given."""
     left, right, _ = seen("plane and sphere")

@@ -17,7 +17,7 @@ def frames(kind, view):
     return pulsed_frames(tof.histogram(view, 6000, background=0.5, seed=4))
 
 
-@pytest.mark.parametrize("kind", ["phases", "timers"])
+@pytest.mark.parametrize("kind", ["phases", pytest.param("timers", marks=pytest.mark.long)])
 def test_zeros_of_pixels_are_said_and_held(tmp_path, kind):
     own = np.random.default_rng(1).normal(0, OWN_M, VIEW.distance.shape)
     _, maps, report = run(write(tmp_path / "own", frames(kind, VIEW._replace(distance=VIEW.distance + own))))
@@ -27,7 +27,7 @@ def test_zeros_of_pixels_are_said_and_held(tmp_path, kind):
     assert np.median(off) < 1.4 and np.mean(off > 5) < 0.03
 
 
-@pytest.mark.parametrize("kind", ["phases", "timers"])
+@pytest.mark.parametrize("kind", ["phases", pytest.param("timers", marks=pytest.mark.long)])
 def test_a_common_zero_raises_no_doubt(tmp_path, kind):
     _, _, report = run(write(tmp_path / "right", frames(kind, VIEW)))
     assert "pixel_scatter_m" not in report["found"]

@@ -27,6 +27,7 @@ def test_the_weightings_differ_and_agree_in_sum(device):
         np.testing.assert_allclose(one.sum(axis=0), other.sum(axis=0), rtol=1e-12)
 
 
+@pytest.mark.long
 @settings(max_examples=15, deadline=None)
 @given(count=st.integers(4, 20), seed=st.integers(0, 100), weighting=st.sampled_from(LightWeights))
 def test_weights_place_the_whole_energy(count, seed, weighting):

@@ -123,6 +123,7 @@ def test_a_bad_part_anywhere_is_refused(path, bad, data):
     assert sentence.startswith("path ") and sentence.isprintable() and len(sentence.splitlines()) == 1
 
 
+@pytest.mark.long
 @given(st.text())
 def test_whatever_is_let_through_is_one_file_below_the_folder(path):
     try:

@@ -47,6 +47,7 @@ def test_a_ball_stands_as_far_before_a_body_as_its_shadows_say(gap, distance, tm
     assert (maps.part[shot.part == 0][inner] == 2).all() and (maps.part == 1).sum() == body["pixels"]
 
 
+@pytest.mark.long
 def test_a_tilted_disc_over_a_plane_has_both_slopes(tmp_path):
     """Half of the slope was lost where outline and axis of tilt are parallel. Robust normals of these matt surfaces are right to 0.02°."""
     shot = shoot(disc_over_plane(), sphere_lights(24, least_z=0.3), side=SIDE, across=2.4)

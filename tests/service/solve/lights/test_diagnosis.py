@@ -133,7 +133,8 @@ OF_PARTS = {
 """Objects whose Lambertian normals are poor on metal, and whose heights have false steps between parts."""
 
 
-@pytest.mark.parametrize("parts", OF_PARTS.values(), ids=OF_PARTS)
+@pytest.mark.parametrize("parts", [
+    pytest.param(OF_PARTS["a ring before a body"], marks=pytest.mark.long), OF_PARTS["islands"]], ids=OF_PARTS)
 @pytest.mark.parametrize(("matrix", "words"), [(np.eye(3), None), (np.diag([-1, -1, 1]), "the surface looks inverted"),
                                                ([[1, 0, 0], [0, 0, 1], [0, 1, 0]], "with y and z swapped")],
                          ids=["right", "turned", "exchanged"])
@@ -162,6 +163,7 @@ def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_pa
     assert confidence(wrong) < UNSURE
 
 
+@pytest.mark.long
 def test_a_perspective_camera_sees_wrong_axes_too(tmp_path):
     scene, camera = seen_from_near(size=112)
     assert alarms(solved(tmp_path / "right", scene, camera=camera)) == []

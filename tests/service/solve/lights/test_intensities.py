@@ -74,6 +74,7 @@ def test_what_the_first_estimate_leaves_is_refined_with_lobes(tmp_path, monkeypa
     assert np.median(error) < 0.6, np.median(error)
 
 
+@pytest.mark.long
 def test_right_intensities_stay(tmp_path):
     error, report = solved(tmp_path, np.ones(LIGHTS))
     assert report["found"]["light_intensities"]["used"] == "declared"

@@ -71,6 +71,7 @@ def test_nothing_is_said_of_right_lights(relit, tmp_path, lights, gloss):
     assert "look near" not in said and "as bright as declared" not in said
 
 
+@pytest.mark.long
 def test_bare_metal_under_distant_lights_does_not_look_lit_from_near(relit, tmp_path):
     """No Lambertian fit explains it, whichever lights; near ones take a tenth off what they leave."""
     surface, toward = dome(40), sphere_directions(96)

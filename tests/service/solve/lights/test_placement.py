@@ -35,6 +35,7 @@ def solved(relit, folder, move, *options, on_a_ball=True):
     return angles_degrees(maps.normal, DOME.normal)[known], maps.sigma[known].astype(float), report
 
 
+@pytest.mark.long
 def test_lights_that_stand_where_they_are_declared_raise_no_doubt(relit, tmp_path):
     error, _, report = solved(relit, tmp_path, lambda place: place)
     assert np.median(error) < 1 and report["warnings"] == [] and "light_placement" not in report["found"]

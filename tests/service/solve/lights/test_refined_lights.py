@@ -52,6 +52,7 @@ def test_right_directions_stay(tmp_path):
     assert angles_degrees(found, scene.directions).max() < 1  # noise and attached shadow
 
 
+@pytest.mark.long
 def test_what_all_lights_have_wrong_together_stays(tmp_path):
     """A turn of the whole table is one of the nine numbers that it alone tells."""
     scene = ellipsoid(count=LIGHTS)
@@ -70,6 +71,7 @@ def test_one_wrong_light_is_put_right_and_named(tmp_path):
     assert any(warning.startswith("004.exr: its light moved by 2") for warning in result.warnings)
 
 
+@pytest.mark.long
 def test_declared_intensities_are_kept_where_they_are_asked_for(tmp_path):
     scene = ellipsoid(count=LIGHTS)
     _, report, _ = solved(tmp_path, scene, turned(scene.directions, 5), intensities="declared")

@@ -30,6 +30,8 @@ def glossy(count):
 SCENES = {"matt": (ellipsoid(size=160, count=16), "robust", None), "few lights": (ellipsoid(size=160, count=8), "robust", None),
           "perspective": (*seen_from_near(size=112)[:1], "lambert", seen_from_near(size=112)[1]),
           "glossy": (glossy(16), "svbrdf", None)}
+QUICK = ["matt", "few lights", "perspective"]
+"""The names of the scenes that take a second or two; the others are `long`."""
 
 
 def solved(folder, name, turn, lights="declared"):
@@ -42,13 +44,15 @@ def solved(folder, name, turn, lights="declared"):
     return error, result.maps.sigma[known].astype(float), json.loads((folder / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [*QUICK, pytest.param("glossy", marks=pytest.mark.long)])
 def test_lights_that_are_declared_right_raise_no_doubt(tmp_path, name):
     _, _, report = solved(tmp_path, name, (0, 0, 0))
     assert "light_turn" not in report["found"] and not any("frames[]" in sentence for sentence in report["warnings"])
 
 
-@pytest.mark.parametrize(("name", "how"), [(name, "tilted") for name in SCENES] + [("perspective", "about the view axis")])
+@pytest.mark.parametrize(("name", "how"), [
+    *((name, "tilted") for name in QUICK), ("perspective", "about the view axis"),
+    pytest.param("glossy", "tilted", marks=pytest.mark.long)])
 def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how):
     """Without it normals were wrong by the turn, beyond ten σ of matt ones, without a word."""
     error, sigma, report = solved(tmp_path, name, TURNS[how])
@@ -58,7 +62,7 @@ def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how
     assert np.median(error) > 2 and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
 
 
-@pytest.mark.parametrize("name", ["few lights", "glossy"])
+@pytest.mark.parametrize("name", ["few lights", pytest.param("glossy", marks=pytest.mark.long)])
 def test_lights_are_turned_back(tmp_path, name):
     error, sigma, report = solved(tmp_path, name, TURNS["tilted"], "refined")
     right, _, _ = solved(tmp_path / "right", name, (0, 0, 0))
@@ -68,6 +72,7 @@ def test_lights_are_turned_back(tmp_path, name):
     assert np.median(left) < BACK
 
 
+@pytest.mark.long
 def test_highlights_refute_slopes(tmp_path, monkeypatch):
     """Materials that the model lacks bend slopes; where there are highlights these decide."""
     monkeypatch.setattr("service.solve.lights.turn.turn_by_slopes", lambda *_, **__: (Rotation.from_rotvec([0, 0.2, 0]), 1e-6 * np.eye(3)))

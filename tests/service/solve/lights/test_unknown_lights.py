@@ -55,7 +55,7 @@ def relief(seed, *, shadows, size=96):
     return Scene(normal, albedo, np.ones_like(x, bool), directions, np.full((LIGHTS, 3), np.pi), np.maximum(noisy, 0))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_cast_shadows_tell_bumps_from_hollows(tmp_path, seed):
     """Weak highlights leave the depth and tilt open, with a wide σ; but the inverse, taken as often before, is never nearer."""
     scene = relief(seed, shadows=True)
@@ -65,7 +65,7 @@ def test_cast_shadows_tell_bumps_from_hollows(tmp_path, seed):
     assert np.mean(error) < np.mean(inverse) and not any("bumps from hollows" in words for words in result.warnings)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_where_nothing_tells_bumps_from_hollows_sigma_holds_both(tmp_path, seed):
     """Normals are off by nothing or by twice their tilt."""
     scene = relief(seed, shadows=False)
