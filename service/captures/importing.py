@@ -50,7 +50,7 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
     if more:
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
-    return imported
+    return imported._replace(facts=(*imported.facts, *(("assumed", sentence) for sentence in manifest.assumed)))
 
 
 def _diligent(request: DiligentImport) -> Imported:

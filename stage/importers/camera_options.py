@@ -59,11 +59,7 @@ def view_of_file(view: View, camera: Path | None, resolution: tuple[int, int]) -
         return view, view.describe()
     if view.focal_px is not None or view.principal_px is not None or view.distortion is not None:
         raise ManifestError(f"{camera}: --camera is given, and --focal-px, --principal-px or --distortion too: give one of both")
-    found = read_camera_matrix(camera)
-    width, height = resolution
-    if not (0 <= found.principal_px[0] <= width and 0 <= found.principal_px[1] <= height):
-        raise ManifestError(f"{camera}: its principal point is {found.principal_px[0]:g}, {found.principal_px[1]:g}, outside the images of "
-                            f"{width}x{height} pixels: it belongs to another resolution")
+    found = read_camera_matrix(camera, resolution)
     distortion = None if found.distortion is None else (*found.distortion.k[:2], *found.distortion.p, found.distortion.k[2])
     view = replace(view, focal_px=found.focal_px, principal_px=found.principal_px, distortion=distortion)
     return view, f"{view.describe()}, from {camera}, where the centre of the first pixel is {found.convention}"

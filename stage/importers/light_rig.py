@@ -13,7 +13,7 @@ from stage.capture.camera import Distortion
 from stage.errors import ManifestError
 from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import first_of, read_json
-from stage.importers.opencv_file import lens, read_matrices
+from stage.importers.opencv_file import CAMERA_SIZE, check_size, lens, read_matrices
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
 AXES = ("dir", "directions", "direction", "orientations", "orientation", "axes", "axis", "ns")
@@ -69,8 +69,9 @@ def read_rig(path: Path) -> LightRig:
                     None if mu is None else mu[:, 0], names if isinstance(names, tuple) else None)
 
 
-def read_camera_matrix(path: Path) -> CameraMatrix:
-    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json)."""
+def read_camera_matrix(path: Path, resolution: tuple[int, int]) -> CameraMatrix:
+    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json).
+    `resolution`: the width and height of its images."""
     matlab = path.suffix.lower() == ".mat"
     matrices = read_mat_arrays(path) if matlab else read_matrices(path)
     name = next((name for name in CAMERA_MATRIX if name in matrices), None)
@@ -84,8 +85,13 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
     shift = MATLAB_CENTRE if matlab else OPENCV_CENTRE
     coefficients = first_of(matrices, CAMERA_LENS)
     glass = None if coefficients is None or not np.any(coefficients) else lens(coefficients, path, "camera")
-    return CameraMatrix((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]) + shift, float(k[1, 2]) + shift), glass,
-                        "1, 1 (MATLAB)" if matlab else "0, 0 (OpenCV)")
+    principal = (float(k[0, 2]) + shift, float(k[1, 2]) + shift)
+    width, height = resolution
+    check_size(path, "camera", matrices, CAMERA_SIZE, resolution)
+    if not (0 <= principal[0] <= width and 0 <= principal[1] <= height):
+        raise ManifestError(f"{path}: its principal point is {principal[0]:g}, {principal[1]:g}, outside the images of {width}x{height} "
+                            "pixels: it belongs to another resolution")
+    return CameraMatrix((float(k[0, 0]), float(k[1, 1])), principal, glass, "1, 1 (MATLAB)" if matlab else "0, 0 (OpenCV)")
 
 
 def _from_mat(path: Path) -> dict[str, Any]:

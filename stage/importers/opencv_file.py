@@ -13,6 +13,8 @@ from stage.errors import ManifestError, storage
 from stage.transforms import OPENCV_FROM_CAMERA
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
+CAMERA_SIZE = (("image_width", "image_height"), ("frameWidth", "frameHeight"))
+"""The names of the image size of a camera in OpenCV's files and in SLStudio's."""
 COEFFICIENTS = 5
 """The count of Brown-Conrady coefficients, k1 k2 p1 p2 k3; a capture cannot hold the rational, thin prism and tilt terms."""
 
@@ -83,6 +85,24 @@ def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path,
     if not np.isfinite(found).all() or (shape is not None and found.size != int(np.prod(shape))):
         raise ManifestError(f"{path}: {name}: must be {' x '.join(map(str, shape or ('finite',)))} numbers")
     return found.reshape(shape) if shape is not None else found
+
+
+def check_size(path: Path, what: str, matrices: Mapping[str, np.ndarray], names: tuple[tuple[str, str], ...],
+               resolution: tuple[int, int]) -> None:
+    """Raise ManifestError if a file says that a calibration is of images of another size.
+    `names`: the names of a width and a height, of which a file holds one pair or none."""
+    for pair in names:
+        given = told_size(matrices, pair)
+        if given is not None and given != tuple(resolution):
+            raise ManifestError("{}: is of a {} of {}x{} px, this one has {}x{}".format(path, what, *given, *resolution))
+
+
+def told_size(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> tuple[int, int] | None:
+    """Return the width and height that a file has under these names, or None."""
+    sides = [matrices[name] for name in names if name in matrices and matrices[name].size == 1]
+    if len(sides) < 2 or not all(float(side.item()).is_integer() and side.item() > 0 for side in sides):
+        return None
+    return int(sides[0].item()), int(sides[1].item())
 
 
 def lens(coefficients: np.ndarray, path: Path, what: str) -> Distortion:

@@ -11,7 +11,7 @@ from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.importers.camera_options import MASK_WORDS, only_image
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
-from stage.importers.opencv_file import camera_from_projector, lens, pick, read_matrices
+from stage.importers.opencv_file import CAMERA_SIZE, camera_from_projector, check_size, lens, pick, read_matrices, told_size
 from stage.importers.pattern_order import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
 
@@ -22,8 +22,8 @@ PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2",
 ROTATION, TRANSLATION = ("R", "rotation", "roatation", "Rp"), ("T", "translation", "t", "Tp")
 """The names under which calibration files hold these matrices and vectors, in order of preference; one common tool misspells, and those
 with a small p or c at the end are SLStudio's."""
-CAMERA_SIZE, PROJECTOR_SIZE = ("frameWidth", "frameHeight"), ("screenResX", "screenResY")
-"""The names of the image sizes in SLStudio's files."""
+PROJECTOR_SIZE = ("screenResX", "screenResY")
+"""The names of the projector's size in SLStudio's files."""
 PIXEL_CENTRE = 0.5
 """The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
@@ -37,14 +37,12 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
     rotation = pick(pose_found, ROTATION, posed, "rotation R", shape=(3, 3))
     translation = pick(pose_found, TRANSLATION, posed, "translation T", shape=(3,)) * unit_m
     pose = camera_from_projector(rotation, translation)
-    entries = {}
+    entries, second_sizes = {}, (PROJECTOR_SIZE,) if second == "projector" else CAMERA_SIZE
     for entry, what, matrix, coefficients, sides, size in (
             ("camera", "camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
-            ("projector", second, PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
-        given = _size(found, sides)
-        if given is not None and given != tuple(size):
-            raise ManifestError(f"{path}: is of a {what} of {given[0]}x{given[1]} px, this one has {size[0]}x{size[1]}")
+            ("projector", second, PROJECTOR_MATRIX, PROJECTOR_LENS, second_sizes, projector)):
         k = pick(found, matrix, path, f"matrix of the {what}", shape=(3, 3))
+        check_size(path, what, found, sides, size)
         known = any(name in found for name in coefficients)
         glass = lens(pick(found, coefficients, path, "distortion"), path, what) if known else Distortion(model="brown_conrady")
         entries[entry] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
@@ -55,14 +53,7 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
 
 def projector_size(path: Path) -> tuple[int, int] | None:
     """Return the width and height of the projector in a calibration file; None where it does not say them."""
-    return _size(read_matrices(path), PROJECTOR_SIZE)
-
-
-def _size(found: dict[str, Any], names: tuple[str, str]) -> tuple[int, int] | None:
-    sides = [found[name] for name in names if name in found and found[name].size == 1]
-    if len(sides) < 2 or not all(float(side.item()).is_integer() and side.item() > 0 for side in sides):
-        return None
-    return int(sides[0].item()), int(sides[1].item())
+    return told_size(read_matrices(path), PROJECTOR_SIZE)
 
 
 LINEAR: ColorSpaceName = "lin_rec709_scene"

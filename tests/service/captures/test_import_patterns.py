@@ -246,6 +246,23 @@ def test_two_cameras(relit, tmp_path, pair, kind):
     assert maps.mask[visible].mean() > 0.7 and np.median(off) < 0.006 and (off > 0.03).mean() < 0.02
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0])
+def test_calibrations_at_another_size_of_images_are_named(relit, tmp_path, pair, factor):
+    """Focal lengths and principal points of images that were binned since; without a word their depths are refused or wrong."""
+    larger = [device._replace(width=round(factor * device.width), height=round(factor * device.height), focal=factor * device.focal)
+              for device in (stereo.CAMERA, stereo.OTHER)]
+    for folder, image in zip(("a", "b"), pair[2], strict=True):
+        write_image(tmp_path / folder / "0.png", image)
+    words = ("import", "stereo", tmp_path / "a", tmp_path / "b", "--unit-m", "0.001", "--calibration")
+    out = relit(*words, write_calibration(tmp_path / "rig.yml", OPENCV, devices=larger, pose=stereo.POSE)).well()
+    named = [f"{field}.principal_px: the calibration is of images of 320x240 px" for field in ("camera", "other_cameras[0]")]
+    assert all((sentence in out) == (factor != 1) for sentence in named)
+    assert [any(sentence in doubt for doubt in Capture.open(tmp_path).doubts) for sentence in named] == [factor != 1] * 2
+    size = {"image_width": larger[0].width, "image_height": larger[0].height}
+    told = relit(*words, write_calibration(tmp_path / "told.yml", OPENCV, devices=larger, pose=stereo.POSE, **size))
+    assert (told.code == 0) == (factor == 1) and (factor == 1 or "told.yml: is of a camera of {}x{} px".format(*size.values()) in told.err)
+
+
 @pytest.mark.parametrize(("left", "right", "message"), [
     (("a/0.png", "a/1.png"), ("b/0.png",), "has 1 images and"), (("c/a/0.png",), ("b/0.png",), "does not lie beside"),
     (("a/0.png",), ("b/0.txt",), "holds no images"), (("a/0.png",), ("a/1.png",), "is named as the left and as the right camera")])

@@ -73,9 +73,17 @@ def test_the_centre_of_the_first_pixel_is_that_of_the_program(tmp_path):
     k = np.array([[700.0, 0, 320], [0, 710, 240], [0, 0, 1]])
     savemat(tmp_path / "camera.mat", {"K": k})
     (tmp_path / "camera.json").write_text(json.dumps({"camera_matrix": k.tolist(), "dist": [[0.1, 0, 0, 0, 0]]}))
-    assert read_camera_matrix(tmp_path / "camera.mat").principal_px == (319.5, 239.5)
-    found = read_camera_matrix(tmp_path / "camera.json")
+    assert read_camera_matrix(tmp_path / "camera.mat", (640, 480)).principal_px == (319.5, 239.5)
+    found = read_camera_matrix(tmp_path / "camera.json", (640, 480))
     assert found.principal_px == (320.5, 240.5) and found.distortion.k == (0.1, 0, 0)
+
+
+def test_the_size_of_the_images_that_a_file_says(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"camera_matrix": [[700, 0, 320], [0, 710, 240], [0, 0, 1]], "image_width": 640, "image_height": 480}))
+    assert read_camera_matrix(path, (640, 480)).focal_px == (700, 710)
+    with pytest.raises(ManifestError, match=r"camera\.json: is of a camera of 640x480 px, this one has 1280x960"):
+        read_camera_matrix(path, (1280, 960))
 
 
 def test_a_camera_that_does_not_fit(folder):
