@@ -4,6 +4,10 @@ An edge lies between two neighbouring pixels whose stripes are neighbours too. O
 d = I - Ī changes sign: where it would be zero, linearly between the two pixels, is the edge, whatever their albedo and whatever the
 blur. A pixel with an edge on either side, one stripe apart, takes its place between them; every other pixel keeps its stripe.
 
+Where pixels see less of the surface than they are apart (in the limit points, as in images that are rendered or shrunk without
+filtering), an edge may pass between two of them unseen, and lies anywhere there. How wide they see is told by how often neither pixel
+of an edge sees a part of either stripe.
+
 Source: Trobina, "Error model of a coded-light range sensor", BIWI technical report 164, ETH Zürich 1995 (crossing of a pattern and
 its inverse).
 """
@@ -28,10 +32,23 @@ REACH = 48
 EDGE_ERROR = 0.065
 """RMS error, in camera pixels, of an edge found by linear interpolation where a pixel sees a sharp square of the surface; blur makes it
 smaller. Both edges of a stripe count with the same error, as they have where stripes are a whole number of pixels wide."""
+UNSEEN_ERROR = 12**-0.5
+"""The same where pixels see points: edges lie anywhere between two of them."""
+WHOLE = 0.8
+"""Part of the difference between white and black from which on a pixel is taken to see one stripe alone. Of edges on sharp squares both
+pixels do so at 1 - WHOLE of them; on squares of a part w of that width at 1 - WHOLE w, where the RMS error is w EDGE_ERROR + (1 - w)
+UNSEEN_ERROR to a hundredth of a pixel."""
+
+
+def edge_error_of(whole: float) -> float:
+    """Return the RMS error in camera pixels of edges found by linear interpolation.
+    `whole`: part of the edges at which both pixels see one stripe alone, to WHOLE of it."""
+    width = min((1 - whole) / WHOLE, 1.0)
+    return width * EDGE_ERROR + (1 - width) * UNSEEN_ERROR
 
 
 def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,
-                 extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
+                 extent: float, stripe_px: float = 1.0, noise: NoiseModel, edge_error: float = EDGE_ERROR) -> Decoded:
     """Interpolate a decoded Gray code between the edges of its stripes; not synchronised on CUDA.
 
     Args:
@@ -43,6 +60,7 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
         down: whether the coordinate changes from row to row (a row code) rather than along a row.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
+        edge_error: RMS error of an edge between two pixels without noise, camera pixels, as of `edge_error_of`.
 
     Raises:
         ArrayError: no inverses, or pixels that are not whole rows or not those decoded.
@@ -64,7 +82,8 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
     coordinate, sigma = (wp.clone(array) for array in decoded[:2])
     devices.launch(_edge_kernel, frames.pixel_count,
                    [as_pixels(frames.values), rows, number, decoded.status, columns, frames.pixel_count // columns, 1 if down else 0,
-                    float(stripe_px), float(extent), noise.read**2, noise.gain], [coordinate, sigma], device=device, uneven=True)
+                    float(stripe_px), float(extent), noise.read**2, noise.gain, edge_error], [coordinate, sigma],
+                   device=device, uneven=True)
     return Decoded(coordinate, sigma, decoded.amplitude, decoded.status)
 
 
@@ -150,6 +169,7 @@ def _edge_kernel(first: int,
                  extent: float,
                  read_variance: float,
                  gain: float,
+                 error: float,
                  # outputs
                  coordinate: wp.array(dtype=float),  # in: stripe centres
                  sigma: wp.array(dtype=float)):
@@ -170,7 +190,7 @@ def _edge_kernel(first: int,
     share = low.at / length
     u = low.place + slope * low.at
     noise_variance = (1.0 - share) * (1.0 - share) * low.variance + share * share * high.variance
-    deviation = wp.abs(slope) * wp.sqrt(noise_variance + wp.static(EDGE_ERROR**2))
+    deviation = wp.abs(slope) * wp.sqrt(noise_variance + error * error)
     if u > 0.0 and u < extent and deviation < sigma[p]:  # not NaN, and better than the stripe alone
         coordinate[p] = u
         sigma[p] = deviation

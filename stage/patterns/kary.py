@@ -130,6 +130,15 @@ def digits_of(code: np.ndarray, base: int, digits: int, *, reflected: bool) -> n
     return shown
 
 
+def number_of(shown: np.ndarray, base: int, *, reflected: bool) -> np.ndarray:
+    """Return the numbers [...] that base-k digits [digits, ...] spell, least significant first: the inverse of `digits_of`."""
+    number, higher = np.zeros_like(shown[0]), np.zeros_like(shown[0])
+    for digit in reversed(shown):
+        number = number * base + (np.where(higher % 2 == 1, base - 1 - digit, digit) if reflected else digit)
+        higher = higher + digit
+    return number
+
+
 def kary_patterns(
     extent: int, axis: Axis, *, base: int,
     reflected: bool = True,  # k-ary Gray code, in which neighbouring stripes differ in one digit by one

@@ -76,7 +76,9 @@ def shown(pattern: dict[str, Any], uv: np.ndarray) -> np.ndarray:
         case "kary":
             code = np.floor(u / pattern["stripe_px"]).astype(int)
             values = np.array(pattern.get("levels") or pattern["colors"], dtype=float)
-            return values[np.clip(code, 0, None) // pattern["base"] ** pattern["digit"] % pattern["base"]]
+            base = pattern["base"]
+            turn = np.clip(code, 0, None) // base ** pattern["digit"] % (2 * base)  # a reflected digit rises, and falls again
+            return values[np.minimum(turn, 2 * base - 1 - turn) if pattern.get("reflected") else turn % base]
         case "xor":
             code = np.floor(u / pattern.get("stripe_px", 1)).astype(int)
             code = code ^ code >> 1

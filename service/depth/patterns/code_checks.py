@@ -11,11 +11,13 @@ from scipy.ndimage import uniform_filter1d
 
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
+from kernels.structured.response import light_of
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
+from stage.patterns.kary import KaryCode, number_of
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 
 CLEAR_BIT, CLEAR_SIGMAS = 0.4, 4.0
@@ -75,7 +77,46 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
                 found = _check_order(stripes, code, extent) or _check_waves(sample, stripes, code, collected, noise)
                 if found is not None:
                     return f"frames: {found}"
+        elif isinstance(code, KaryCode) and code.colors is None:
+            found = _check_digits(sample, code, collected, projector, noise)
+            if found is not None:
+                return f"frames: {found}"
     return None
+
+
+def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
+    """Return how digits are declared wrongly; None if stripes follow each other as declared, or too few pixels read all digits."""
+    if code.lacks(collected.white, collected.black) is not None:
+        return None
+    grey, (height, width) = sample.grey, sample.mask.shape
+    white, black = grey[collected.white], grey[collected.black]
+    levels = light_of(projector.response, np.arange(code.base) / (code.base - 1) if code.levels is None else np.array(code.levels))
+    part = (grey[list(code.frames)] - black) / np.maximum(white - black, 1e-9)
+    away = np.abs(part - levels[:, None, None])
+    deviation = np.sqrt(2 * noise.read**2 + 2 * noise.gain * np.maximum(white, 0)) / np.maximum(white - black, 1e-9)
+    gap = np.diff(np.sort(levels)).min()
+    known = sample.lit(grey, noise) & (away.min(axis=0).max(axis=0) < CLEAR_BIT / 2 * gap) & (deviation * CLEAR_SIGMAS < gap / 2)
+    pairs = _Pairs.of(known.reshape(height, width))
+    digits = away.argmin(axis=0)
+    steps = pairs.steps(number_of(digits, code.base, reflected=code.reflected))
+    if len(steps) < ENOUGH or not steps.any():
+        return None
+    jumps = steps > JUMP * max(float(np.median(steps[steps > 0])), 1.0)
+    count = projector.resolution[0 if code.axis == "column" else 1] / code.stripe_px
+    others = [(f"reflected is {str(not code.reflected).lower()}: check it", digits, not code.reflected)]
+    for first, second in combinations(range(len(digits)), 2):
+        order = np.arange(len(digits))
+        order[[first, second]] = second, first
+        others.append((f"the digits {first} and {second} are exchanged: check digit", digits[order], code.reflected))
+    mended = []
+    for words, shown, reflected in others:
+        better = _mends(number_of(shown, code.base, reflected=reflected), pairs, steps, jumps, count, outside=False)
+        if better is not None:
+            mended.append((better, words))
+    if not mended:
+        return None
+    return (f"the {code.axis} stripes of the kary code do not follow each other as declared; they do if {min(mended)[1]} in the frames' "
+            "patterns")
 
 
 def read_stripes(sample: Sample, code: BinaryCode, collected: Collected, noise: NoiseModel) -> Stripes | None:

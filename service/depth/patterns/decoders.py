@@ -13,7 +13,7 @@ import numpy as np
 from kernels.structured.binary import FINE_BITS, decode_binary, decode_gray, decode_xor
 from kernels.structured.confirm import AROUND, confirm_stripes
 from kernels.structured.decoded import Decoded
-from kernels.structured.edges import REACH, refine_edges
+from kernels.structured.edges import EDGE_ERROR, REACH, refine_edges
 from kernels.structured.kary import decode_kary
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
@@ -43,6 +43,8 @@ class PatternProjector(NamedTuple):
     """The exponent γ of light = level^γ that the waves show though no response is given: their error is added to the deviation."""
     left_rad: float | None = None
     """The error of a phase that is left when waves are bent back by the exponent; None: they are not bent back."""
+    edge_error_px: float = EDGE_ERROR
+    """The error in camera pixels of an edge of stripes, as of `measured_edge_error`."""
 
     @property
     def wave_response(self) -> Sequence[float] | None:
@@ -194,7 +196,7 @@ def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
         found = _decode_stripes(code, axis, readings, noise)
         if edges and inverses is not None:
             found = refine_edges(found, readings.alike, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
-                                 extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
+                                 extent=axis.extent, stripe_px=code.stripe_px, noise=noise, edge_error=axis.projector.edge_error_px)
         if confirmed and inverses is not None:
             found = confirm_stripes(found, readings.alike, code.frames, inverses, columns=readings.columns, stripe_px=code.stripe_px,
                                     noise=noise)
@@ -241,7 +243,8 @@ def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | Modulated
         stripes = _decode_stripes(numbering, axis, readings, noise)
         if inverses is not None:
             stripes = refine_edges(stripes, readings.alike, numbering.frames, inverses, columns=readings.columns, down=axis.axis == "row",
-                                   extent=axis.extent, stripe_px=numbering.stripe_px, noise=noise)
+                                   extent=axis.extent, stripe_px=numbering.stripe_px, noise=noise,
+                                   edge_error=axis.projector.edge_error_px)
         return unwrap_by_code(wrapped(readings, noise), stripes, stripe_px=numbering.stripe_px, extent=axis.extent)
 
     return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}{', edges refined' if inverses else ''}", _coloured(numbering),

@@ -13,7 +13,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
 from service.depth.patterns.levels import contrasts
-from service.depth.patterns.pattern_checks import grey_of
+from service.depth.patterns.readings import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.phase import PhaseCode

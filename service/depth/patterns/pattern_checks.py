@@ -15,10 +15,9 @@ from kernels.structured.response import bent_wave
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
-from service.depth.patterns.readings import Readings
+from service.depth.patterns.readings import Readings, grey_of
 from service.depth.patterns.swing import exponent_of_swing
 from stage.capture.camera import Camera
-from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import StageError
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
@@ -57,11 +56,6 @@ LIT_SIGMAS = 20.0
 their patterns."""
 LEAST_SIGNAL = 20.0
 """Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
-
-
-def grey_of(values: np.ndarray) -> np.ndarray:
-    """Return [frames, pixels] of readings [frames, channels, pixels] float32."""
-    return np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
 
 
 class Sample(NamedTuple):

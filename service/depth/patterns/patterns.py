@@ -22,6 +22,7 @@ from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
+from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_noise
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
@@ -29,6 +30,7 @@ from service.depth.patterns.pattern_checks import check_declaration, check_uneve
 from service.depth.patterns.projector_doubts import contradicted, widen
 from service.depth.patterns.readings import Readings
 from service.depth.patterns.shifted_frames import widen_shifted
+from service.depth.patterns.unseen_edges import measured_edge_error
 from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
@@ -101,6 +103,9 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
+        noise, noisier = with_measured_noise(sample_of(planes, capture.camera, mask), codes.collected, noise)
+        shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise))
+        codes = read_codes(capture, frames, shown, refine=request.refine)
         warnings, codes, declared = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
@@ -117,9 +122,14 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
     warnings += said
+    if noisier >= SAID_NOISIER:
+        warnings.append(f"frames[]: readings are {noisier:.2g} times as noisy as --read-noise and --photon-gain say, and decoded as such: "
+                        "expose longer, or say how noisy the camera is")
     facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
+    if noisier > 1:
+        facts["noise_factor"] = float(f"{noisier:.3g}")
     if coordinates.shift_px:
         facts["image_shift_px"] = float(f"{coordinates.shift_px:.3g}")
     if series is not None and joined is not None:

@@ -16,6 +16,7 @@ from kernels.structured.response import bent_wave
 from stage.colour.colour import GREY_WEIGHTS
 from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.stack.planes import Planes
 
 
 class EvenLight(NamedTuple):
@@ -88,7 +89,7 @@ class Readings(NamedTuple):
             saturated: [frames, pixels] bool; None when no reading saturates.
             exposure: [pixels] by which the values were multiplied; None: all by the same.
         """
-        grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+        grey = grey_of(values)
         bits = None if saturated is None else saturated_bits(saturated)
         colour = upload(values, bits, device=device) if values.shape[1] > 1 else None
         radiance = None if exposure is None else upload(np.ascontiguousarray(grey / exposure), bits, device=device)
@@ -100,3 +101,19 @@ class Readings(NamedTuple):
             cut = saturated[list(made.frames)].any(axis=0, keepdims=True)
             bits = saturated_bits(np.concatenate([saturated, cut, cut]))
         return cls(upload(grey, bits, device=device), colour, columns, (count, count + 1), radiance)
+
+
+def grey_of(values: np.ndarray) -> np.ndarray:
+    """Return [frames, pixels] of readings [frames, channels, pixels] float32."""
+    return np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0])) if values.shape[1] > 1 else values[:, 0]
+
+
+def line_readings(planes: Planes, lines: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the readings [frames, lines, length] of some image rows or columns, and where a frame is clipped [lines, length]."""
+    if across == 1:
+        values = np.moveaxis(planes.values[:, lines], 2, 1)
+        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, lines].any(axis=0))
+    else:
+        values = np.moveaxis(planes.values[:, :, :, lines], (2, 3), (1, 2))
+        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, :, lines].any(axis=0)).T
+    return grey_of(values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:]), clipped

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter, uniform_filter
 
+from kernels.structured.edges import WHOLE, edge_error_of
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
 from service.depth.patterns.levels import contrasts
-from service.depth.patterns.pattern_checks import grey_of
+from service.depth.patterns.readings import line_readings
 from stage.capture.manifest import Frame
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -47,9 +48,6 @@ ROUNDS = 20
 CLEAR_SIGMAS, OTHERS_SIGMAS, CLEAR_PX = 5.0, 3.0, 0.05
 """By how much the frames must differ in standard deviations, all of them and whichever of them is left out, and in camera pixels then: the
 finest alone is shifted by light below surfaces, the coarsest by what moves near its edge."""
-EDGE_PX = 0.05
-"""Deviation in camera pixels of one edge of the projector on all lines: where it lies between the pixels moves where it seems to be, and on
-a surface that faces the camera it lies alike on every line."""
 OVER = 15
 """Side in pixels of the square over which the step of places from pixel to pixel is averaged."""
 
@@ -111,7 +109,7 @@ def find_shifts(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
     if code.lacks(collected.white, collected.black) is not None:
         return None
     lines = _on_lines(axis, across)
-    grey, clipped = _readings(planes, _even_lines(axis, across), across)
+    grey, clipped = line_readings(planes, _even_lines(axis, across), across)
     inverses = code.inverses if isinstance(code, BinaryCode) else None
     contrast = contrasts(grey, code, collected)
     white = np.abs(contrast).max(axis=0) if inverses is not None else grey[collected.white] - grey[collected.black]
@@ -172,17 +170,6 @@ def _slope(axis: AxisMaps, across: int) -> np.ndarray:
     return np.where(count > 0.1, np.abs(summed) / np.maximum(count, 0.1), usual)
 
 
-def _readings(planes: Planes, lines: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the readings [frames, lines, length] of some image rows or columns, and where a frame is clipped [lines, length]."""
-    if across == 1:
-        values = np.moveaxis(planes.values[:, lines], 2, 1)
-        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, lines].any(axis=0))
-    else:
-        values = np.moveaxis(planes.values[:, :, :, lines], (2, 3), (1, 2))
-        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, :, lines].any(axis=0)).T
-    return grey_of(values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:]), clipped
-
-
 def _seen_levels(level: np.ndarray, expected: np.ndarray, stripe: np.ndarray) -> np.ndarray:
     """Return the light of each stripe as it is usually seen, in place of that `expected` [stripes]: a projector may bend it, and other
     light be added to it. `level` and `stripe`: of pixels [n]."""
@@ -196,25 +183,28 @@ def _seen_levels(level: np.ndarray, expected: np.ndarray, stripe: np.ndarray) ->
 
 def _edges(level: np.ndarray, place: np.ndarray, seen: np.ndarray, expected: np.ndarray, stripe_px: float, usual: float,
            frame: int) -> np.ndarray:
-    """Return the edges of one frame whose stripes are wide enough, [edges, 4]: the line, the camera pixel, the projector's, and `frame`.
+    """Return the edges of one frame whose stripes are wide enough, [edges, 5]: the line, the camera pixel, the projector's, `frame`, and
+    whether both pixels at the edge see one stripe alone.
 
     `level`: light between black (0) and white (1), [lines, length]. `expected`: that of each stripe. `usual`: usual step of places.
     """
     edge = np.flatnonzero(np.diff(expected)) + 1
     gap = np.diff(np.concatenate([[-np.inf], edge * stripe_px, [np.inf]]))
     width = np.minimum(gap[1:], gap[:-1])
-    middle = (expected[edge] + expected[edge - 1]) / 2
+    middle, half = (expected[edge] + expected[edge - 1]) / 2, np.abs(expected[edge] - expected[edge - 1]) / 2
     wide = width >= LEAST_WIDTH * usual
-    found = [np.zeros((0, 4))]
+    found = [np.zeros((0, 5))]
     for value in np.unique(middle[wide]):
-        at, limit = edge[wide & (middle == value)] * stripe_px, OWN_PART * np.minimum(width[wide & (middle == value)], 1e9)
+        of = wide & (middle == value)
+        at, limit = edge[of] * stripe_px, OWN_PART * np.minimum(width[of], 1e9)
         away = level - value
         line, pixel = np.nonzero((away[:, 1:] * away[:, :-1] < 0) & seen[:, 1:] & seen[:, :-1])
         before, after = away[line, pixel], away[line, pixel + 1]
         there = (place[line, pixel] + place[line, pixel + 1]) / 2
         nearest = np.abs(there[:, None] - at).argmin(axis=1)
         own = np.abs(there - at[nearest]) < limit[nearest]
-        found.append(np.stack([line, pixel + before / (before - after), at[nearest], np.full(len(line), frame)], axis=1)[own])
+        whole = np.minimum(np.abs(before), np.abs(after)) >= WHOLE * half[of][nearest]
+        found.append(np.stack([line, pixel + before / (before - after), at[nearest], np.full(len(line), frame), whole], axis=1)[own])
     return np.concatenate(found)
 
 
@@ -222,7 +212,7 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     """Return the shifts that edges tell, each against those before and after it on its line, by least squares whose weights fall with
     the residual as a Cauchy distribution's (Holland and Welsch, 1977); None where they tell fewer than two, or do not lie on surfaces."""
     edges = edges[np.lexsort((edges[:, 1], edges[:, 0]))]
-    line, pixel, at, frame = edges.T
+    line, pixel, at, frame, whole_pixels = edges.T
     if len(edges) < 3:
         return None
     run, long = at[2:] - at[:-2], pixel[2:] - pixel[:-2]
@@ -252,6 +242,8 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     if weight.mean() < FITTING:
         return None
     deviation = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ (weight[:, None] * design))))[:-1]
+    # an edge of the projector seems to lie elsewhere by where it lies between the pixels, and alike on every line of a surface that faces
+    # the camera
     places = [max(len(np.unique(at[1:-1][even & (here[1:-1] == each)])), 1) for each in np.flatnonzero(told)]
-    deviation = np.hypot(deviation, EDGE_PX / np.sqrt(places))
+    deviation = np.hypot(deviation, edge_error_of(whole_pixels.mean()) / np.sqrt(places))
     return FrameShifts(shift[:-1] - shift[:-1].mean(), deviation, time[told])

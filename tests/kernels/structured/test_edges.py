@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_gray
-from kernels.structured.edges import refine_edges
+from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of, refine_edges
 from kernels.structured.pattern_frames import NoiseModel, upload
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
@@ -21,10 +21,10 @@ def slope_of(per_pixel, rows=ROWS, columns=COLUMNS):
     return 100 + 0.37 * np.arange(rows)[:, None] + per_pixel * np.arange(columns)[None, :]
 
 
-def run(u, device, *, per_pixel, stripe=1, noise=QUIET, down=False, spoil=None):
+def run(u, device, *, per_pixel, stripe=1, noise=QUIET, down=False, spoil=None, seen=1.0, edge_error=EDGE_ERROR):
     patterns = binary_patterns(WIDTH, "column", stripe_px=stripe)
     image = u.T if down else u
-    stack = view(patterns, image.ravel(), WIDTH, noise=noise, blur=abs(per_pixel), albedo=np.linspace(0.4, 0.9, image.size))
+    stack = view(patterns, image.ravel(), WIDTH, noise=noise, blur=seen * abs(per_pixel), albedo=np.linspace(0.4, 0.9, image.size))
     if spoil is not None:
         spoil(stack)
     found = collect(patterns)
@@ -33,7 +33,7 @@ def run(u, device, *, per_pixel, stripe=1, noise=QUIET, down=False, spoil=None):
     plain = decode_gray(frames, code.frames, code.inverses, white=found.white, black=found.black, extent=WIDTH, stripe_px=stripe,
                         noise=noise)
     fine = refine_edges(plain, frames, code.frames, code.inverses, columns=image.shape[1], down=down, extent=WIDTH, stripe_px=stripe,
-                        noise=noise)
+                        noise=noise, edge_error=edge_error)
     results = [result(decoded, image.size) for decoded in (plain, fine)]
     return [[(array.reshape(image.shape).T if down else array.reshape(image.shape)) for array in arrays] for arrays in results]
 
@@ -52,6 +52,20 @@ def test_edges_are_finer_than_stripes(per_pixel, stripe, down, device):
     assert np.abs(error).max() < 0.6 * stripe
     z = error / fine[1][refined]
     assert 0.75 < z.std() < 1.2  # what interpolation misses is the same at both edges or not, as their places among the pixels have it
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3, 0.6, 0.9, 1.3, 2.0])
+@pytest.mark.parametrize("per_pixel", [0.31, 0.83])
+def test_sigma_holds_edges_that_pass_between_pixels_unseen(per_pixel, seen, device):
+    """Pixels see a part of the distance between them, in the limit points, as in images that are shrunk without a filter: to WHOLE of it
+    both pixels of an edge see one stripe alone where it passes between these parts."""
+    u = slope_of(per_pixel, rows=200)
+    plain, fine = run(u, device, per_pixel=per_pixel, stripe=4, seen=seen, edge_error=edge_error_of(max(1 - WHOLE * seen, 0)))
+    refined = (fine[1] < plain[1]) & (fine[3] == Status.OK)
+    assert refined.mean() > 0.5
+    z = (fine[0] - u)[refined] / fine[1][refined]
+    assert z.std() < 1.2 and (np.abs(z) > 3).mean() < 0.01  # at all sizes up to that of a square pixel; blur makes errors smaller
+    assert seen > 1 or z.std() > 0.75
 
 
 def test_sigma_follows_the_noise(device):

@@ -22,6 +22,14 @@ THREE = [*phase_patterns("column", 18.0, 3), *gray_patterns("column", stripe=8, 
 BINARY = [{**pattern, "code": "binary"} if pattern["code"] == "gray" else pattern for pattern in GRAY]
 
 
+def kary(base, *, reflected=False):
+    """Digits of an even number of stripes of 2 px, and white and black."""
+    digits = int(np.ceil(np.log(SIZE[0] / 2) / np.log(base)))
+    levels = [value / (base - 1) for value in range(base)]
+    return [*({"code": "kary", "axis": "column", "base": base, "digit": digit, "digits": digits, "stripe_px": 2, "levels": levels,
+               "reflected": reflected} for digit in range(digits)), *BLACK_WHITE]
+
+
 @pytest.fixture(scope="module")
 def scene():
     return make_scene()
@@ -46,7 +54,8 @@ def changed(patterns, code, **fields):
 
 @pytest.mark.parametrize("patterns", [
     GRAY, BINARY, WAVES, THREE, [*phase_patterns("row", 16.0), *gray_patterns("row", stripe=8)],
-    [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=16)]], ids=["gray", "binary", "waves", "three", "rows", "wide"])
+    [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=16)], kary(3), kary(4, reflected=True)],
+    ids=["gray", "binary", "waves", "three", "rows", "wide", "3-ary", "4-ary, reflected"])
 def test_right_declarations_raise_no_doubt(scene, patterns):
     assert said(scene, patterns, patterns) is None
 
@@ -68,6 +77,16 @@ def test_a_wrong_declaration_is_named(scene, patterns, declared, words):
 def test_any_two_bits_that_are_exchanged_are_named(scene, swap):
     declared = changed(GRAY, "gray", bit=lambda p: dict([swap, swap[::-1]]).get(p["bit"], p["bit"]))
     assert f"the bits {swap[0]} and {swap[1]} are exchanged" in said(scene, GRAY, declared)
+
+
+@pytest.mark.parametrize("base", [3, 4, 5])
+@pytest.mark.parametrize("reflected", [False, True])
+def test_digits_that_are_declared_otherwise_are_named(scene, base, reflected):
+    """Half of the depths were off by many stripes, without a word."""
+    right = kary(base, reflected=reflected)
+    assert f"reflected is {str(reflected).lower()}" in said(scene, right, kary(base, reflected=not reflected))
+    exchanged = changed(right, "kary", digit=lambda p: {0: 1, 1: 0}.get(p["digit"], p["digit"]))
+    assert "the digits 0 and 1 are exchanged" in said(scene, right, exchanged)
 
 
 @pytest.mark.parametrize("step", [2.2, 3.0, 3.4])
