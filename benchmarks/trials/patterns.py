@@ -70,6 +70,8 @@ BELOW: dict[str, dict[str, Any]] = {"30 % of the light": {"scattered": 0.3}, "90
 NOISES = {"": (0.003, 10000.0), ", weak light": (0.006, 2500.0)}
 """Read noise as a part of full scale, and electrons at full scale."""
 
+NOISY = 0.02
+
 
 def trials(data: Path | None) -> Iterator[Trial]:
     """Yield a trial for every code, and for every scene that is out of their model."""
@@ -79,6 +81,10 @@ def trials(data: Path | None) -> Iterator[Trial]:
         for name in CODES if not words else ("Gray, inverses", "binary, white and black", "k-ary, plain", "ramps",
                                                     "phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
             yield _run(f"{name}{words}", True, world, CODES[name], light)
+    for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "ramps"):
+        yield _run(f"{name}, noise of {100 * NOISY:g} % declared as {100 * NOISES[''][0]:g}", False, World(shapes=SHELF, read_noise=NOISY),
+                   CODES[name], light, read_noise=NOISES[""][0])
+    yield _run("Gray, inverses, images of points", False, World(shapes=SHELF, samples=1, blur_px=0.0), GRAY)
     response = (np.linspace(0, 1, 256)**GAMMA).tolist()
     for name, patterns in BENT.items():
         bent = World(shapes=SHELF, gamma=GAMMA)
@@ -152,6 +158,8 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
         "Gray, bits declared backwards": (GRAY, _changed(bit=lambda p: getattr(p, "bits", 1) - 1 - getattr(p, "bit", 0))),
         "Gray declared as binary": (GRAY, _changed(code=lambda p: "binary" if p.code == "gray" else p.code)),
         "Gray, bits 5 and 6 exchanged": (GRAY, _changed(bit=lambda p: {5: 6, 6: 5}.get(getattr(p, "bit", 0), getattr(p, "bit", 0)))),
+        **{f"k-ary, {name}, declared otherwise": (CODES[f"k-ary, {name}"], _changed(reflected=lambda p: not getattr(p, "reflected", False)))
+           for name in ("reflected", "plain")},
         "phase 16, 4 steps, Gray, steps backwards": (PHASE_GRAY, _changed(step=lambda p: -getattr(p, "step", 0) % getattr(p, "steps", 1))),
         "phase 16, 4 steps, Gray, a step late": (PHASE_GRAY, _changed(step=lambda p: (getattr(p, "step", 0) + 1) % getattr(p, "steps", 1))),
         **{f"{name}, {words}": (CODES.get(name, ONE), change)
@@ -167,10 +175,11 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
 def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,
          declared: Sequence[Pattern] | None = None, *, refined: bool = False, moments: Sequence[Light] | None = None,
          aside: Sequence[tuple[float, float]] | None = None,
-         others: Sequence[np.ndarray] = (), near: np.ndarray | None = None, **projector: object) -> Trial:
+         others: Sequence[np.ndarray] = (), near: np.ndarray | None = None, read_noise: float | None = None, **projector: object) -> Trial:
     """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth.
 
-    `others`: further depths [rows, cols] that are right. `near`: the pixels [rows, cols] bool that count; None: all.
+    `others`: further depths [rows, cols] that are right. `near`: the pixels [rows, cols] bool that count; None: all. `read_noise`: as it is
+    declared; None: that of the world.
     """
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
@@ -178,7 +187,7 @@ def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], l
                               declared=declared, moments=moments, aside=aside, **projector)
         known = (light.lit if near is None else near) & np.isfinite(light.depth)
         try:
-            found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=world.read_noise,
+            found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=read_noise or world.read_noise,
                                        photon_gain=1 / world.electrons, refine_projector=refined))
         except StageError as error:
             nothing = np.zeros(int(known.sum()))

@@ -36,6 +36,8 @@ PLACES, AT_A_PLACE, OF_STEPS = 3, 8, 0.01
 steps, from which on that order is named. An edge of depth jumps between other stripes in every row."""
 MENDED = 5.0
 """Jumps that another order mends over those that it makes."""
+LEFT_JUMPS = 0.1
+"""Jumps, as a part of all steps, below which stripes of k-ary digits follow each other."""
 DENSE = 0.8
 """Part of the neighbours with other bits that differ in one alone, from which on they lie in stripes side by side: stripes three apart may
 differ in one bit too."""
@@ -110,8 +112,10 @@ def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projecto
         others.append((f"the digits {first} and {second} are exchanged: check digit", digits[order], code.reflected))
     mended = []
     for words, shown, reflected in others:
-        better = _mends(number_of(shown, code.base, reflected=reflected), pairs, steps, jumps, count, outside=False)
-        if better is not None:
+        numbers = number_of(shown, code.base, reflected=reflected)
+        better, after = _mends(numbers, pairs, steps, jumps, count, outside=False), pairs.steps(numbers)
+        after = after[after > 0]
+        if better is not None and (after > JUMP * np.median(after)).mean() < LEFT_JUMPS:  # more where the camera moves between frames
             mended.append((better, words))
     if not mended:
         return None

@@ -26,7 +26,7 @@ from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_no
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import SAID, EvenSums
-from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
+from service.depth.patterns.pattern_checks import Sample, check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.projector_doubts import contradicted, widen
 from service.depth.patterns.readings import Readings
 from service.depth.patterns.shifted_frames import widen_shifted
@@ -103,10 +103,13 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
-        noise, noisier = with_measured_noise(sample_of(planes, capture.camera, mask), codes.collected, noise)
         shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise))
         codes = read_codes(capture, frames, shown, refine=request.refine)
-        warnings, codes, declared = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
+        sample = sample_of(planes, capture.camera, mask)
+        warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, device, request)
+        noisier = 1.0
+        if declared:  # else what contradicts the declaration would count as noise
+            noise, noisier = with_measured_noise(sample, codes.collected, noise)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
             timings.stage("decode", mask.shape[0])
@@ -118,7 +121,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, frames, noise, device, request,
                                      timings, declared=declared)
-        moved, said = _moved(planes, mask, capture, codes.collected, noise, shifted=coordinates.shift_px > 0)
+        moved, said = _moved(planes, mask, sample, codes.collected, noise, shifted=coordinates.shift_px > 0)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
     warnings += said
@@ -181,10 +184,9 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
     return PatternProjector((size["column"] or 1, size["row"] or 1))  # an axis without a code has no coordinate
 
 
-def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
-             capture: Capture, frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> Checks:
+def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projector: Projector | None, capture: Capture,
+             frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> Checks:
     """Judge the declaration by a sample of the frames."""
-    sample = sample_of(planes, capture.camera, mask)
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
@@ -206,11 +208,10 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     return Checks(said, codes, True)
 
 
-def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel, *,
+def _moved(planes: Planes, mask: np.ndarray, sample: Sample, collected: Collected, noise: NoiseModel, *,
            shifted: bool) -> tuple[np.ndarray, list[str]]:
     """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
     if it is everywhere, where most stripes are read rightly all the same. `shifted`: whether it is said already that images have."""
-    sample = sample_of(planes, capture.camera, mask)
     sums = EvenSums.of(sample, collected, noise)
     moved = np.zeros(mask.shape, bool)
     if sums is None or not sums.moved(sample, noise).any():
