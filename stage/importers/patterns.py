@@ -37,7 +37,8 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
     rotation = pick(pose_found, ROTATION, posed, "rotation R", shape=(3, 3))
     translation = pick(pose_found, TRANSLATION, posed, "translation T", shape=(3,)) * unit_m
     pose = camera_from_projector(rotation, translation)
-    entries, second_sizes = {}, (PROJECTOR_SIZE,) if second == "projector" else CAMERA_SIZE
+    entries = {}
+    second_sizes = (PROJECTOR_SIZE,) if second == "projector" else ()  # a file of two cameras says the size of the first
     for entry, what, matrix, coefficients, sides, size in (
             ("camera", "camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
             ("projector", second, PROJECTOR_MATRIX, PROJECTOR_LENS, second_sizes, projector)):

@@ -263,6 +263,17 @@ def test_calibrations_at_another_size_of_images_are_named(relit, tmp_path, pair,
     assert (told.code == 0) == (factor == 1) and (factor == 1 or "told.yml: is of a camera of {}x{} px".format(*size.values()) in told.err)
 
 
+def test_the_second_camera_may_have_images_of_another_size(relit, tmp_path):
+    """`image_width` is that of the first."""
+    wide = stereo.OTHER._replace(width=400, height=300)
+    for folder, device in (("a", stereo.CAMERA), ("b", wide)):
+        write_image(tmp_path / folder / "0.png", np.zeros((device.height, device.width), np.uint8))
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, wide), pose=stereo.POSE, image_width=stereo.CAMERA.width,
+                            image_height=stereo.CAMERA.height)
+    out = relit("import", "stereo", tmp_path / "a", tmp_path / "b", "--calibration", rig, "--unit-m", "0.001").well()
+    assert "principal_px" not in out and Capture.open(tmp_path).manifest.other_cameras[0].resolution == (400, 300)
+
+
 @pytest.mark.parametrize(("left", "right", "message"), [
     (("a/0.png", "a/1.png"), ("b/0.png",), "has 1 images and"), (("c/a/0.png",), ("b/0.png",), "does not lie beside"),
     (("a/0.png",), ("b/0.txt",), "holds no images"), (("a/0.png",), ("a/1.png",), "is named as the left and as the right camera")])
