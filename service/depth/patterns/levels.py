@@ -18,10 +18,13 @@ from kernels.structured.response import bent_wave, fitted_curve
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import ENOUGH, LIT_SIGMAS, Sample
 from stage.patterns.binary import BinaryCode
-from stage.patterns.codes import Collected
+from stage.patterns.codes import Code, Collected
 from stage.patterns.kary import KaryCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.patterns.ramp import RampCode
 
+HALVES = np.array([0.5, 0.5])
+"""Weights of two frames in their mean."""
 CLEAR_SIGMAS = 5.0
 """Difference of two sums, in its standard deviations, from which on it is none of noise."""
 LEAST_PART, WAVE_PART = 0.04, 0.02
@@ -132,6 +135,24 @@ def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray
     row = np.zeros(frames)
     row[list(places)] = values
     return row
+
+
+def even_means(code: Code, frames: int, least_steps: int = FULL_STEPS) -> list[np.ndarray]:
+    """Return the weights [frames] of the frames in each mean of a code that is half the light of white and black: of bits and their
+    inverses, of ramps both ways, and of waves over their shifts, of which there are `least_steps`."""
+    if isinstance(code, BinaryCode) and code.inverses is not None:
+        return [row_of(frames, pair, HALVES) for pair in zip(code.frames, code.inverses, strict=True)]
+    if isinstance(code, RampCode) and code.up is not None and code.down is not None:
+        return [row_of(frames, (code.up, code.down), HALVES)]
+    found: list[np.ndarray] = []
+    if not isinstance(code, PhaseCode):
+        return found
+    for period in dict.fromkeys(code.periods_px):
+        members = [index for index, other in enumerate(code.periods_px) if other == period]
+        if len(members) >= least_steps:
+            shifts = np.array([code.shifts[index] for index in members])
+            found.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
+    return found
 
 
 def check_levels(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:

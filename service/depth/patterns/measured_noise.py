@@ -10,13 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
-from kernels.structured.phase import weights
-from service.depth.patterns.levels import row_of
+from service.depth.patterns.levels import HALVES, even_means, row_of
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
-from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
-from stage.patterns.phase import PhaseCode
-from stage.patterns.ramp import RampCode
 from stage.spread import MAD_TO_SIGMA
 
 UNBENT_STEPS = 4
@@ -49,19 +45,8 @@ def with_measured_noise(sample: Sample, collected: Collected, noise: NoiseModel)
 
 def _even_sums(collected: Collected, frames: int) -> list[np.ndarray]:
     """Return the weights [frames] float32 of the frames in each mean that is half the light of white and black."""
-    half = np.array([0.5, 0.5])
     rows = []
     if collected.white is not None and collected.black is not None:
-        rows.append(row_of(frames, [collected.white, collected.black], half))
-    for code in collected.codes:
-        if isinstance(code, BinaryCode) and code.inverses is not None:
-            rows += [row_of(frames, pair, half) for pair in zip(code.frames, code.inverses, strict=True)]
-        elif isinstance(code, RampCode) and code.up is not None and code.down is not None:
-            rows.append(row_of(frames, [code.up, code.down], half))
-        elif isinstance(code, PhaseCode):
-            for period in dict.fromkeys(code.periods_px):
-                members = [index for index, other in enumerate(code.periods_px) if other == period]
-                if len(members) >= UNBENT_STEPS:
-                    shifts = np.array([code.shifts[index] for index in members])
-                    rows.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
+        rows.append(row_of(frames, (collected.white, collected.black), HALVES))
+    rows += [row for code in collected.codes for row in even_means(code, frames, UNBENT_STEPS)]
     return [row.astype(np.float32) for row in rows]

@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
-from kernels.structured.phase import weights
-from service.depth.patterns.levels import row_of
+from service.depth.patterns.levels import even_means
 from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, Sample
+from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
-from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.patterns.phase import PhaseCode
+from stage.stack.planes import Planes
 
 CLEAR_SIGMAS, LEAST_PART = 6.0, 0.04
 """Least difference of a sum from its usual part of white, in deviations of noise and in white, from which on a surface has moved: lamps
@@ -44,19 +45,9 @@ class EvenSums(NamedTuple):
         if collected.white is None or collected.black is None:
             return None
         frames = len(sample.values)
-        rows: list[np.ndarray] = []
-        for code in collected.codes:
-            if isinstance(code, BinaryCode) and code.inverses is not None:
-                for pair in zip(code.frames, code.inverses, strict=True):
-                    rows.append(row_of(frames, pair, np.array([0.5, 0.5])))
+        rows = [row for code in collected.codes if isinstance(code, BinaryCode) for row in even_means(code, frames)]
         bits = len(rows)
-        for code in collected.codes:
-            if isinstance(code, PhaseCode):
-                for period in dict.fromkeys(code.periods_px):
-                    members = [index for index, other in enumerate(code.periods_px) if other == period]
-                    if len(members) >= FULL_STEPS:
-                        shifts = np.array([code.shifts[index] for index in members])
-                        rows.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
+        rows += [row for code in collected.codes if isinstance(code, PhaseCode) for row in even_means(code, frames)]
         if not bits:
             return None
         found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black,
@@ -90,3 +81,27 @@ class EvenSums(NamedTuple):
         found = np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))
         found &= sample.values.max(axis=(0, 1)) < self.full
         return found if sample.saturated is None else found & ~sample.saturated.any(axis=0)
+
+
+def moved_pixels(planes: Planes, mask: np.ndarray, sample: Sample, collected: Collected, noise: NoiseModel, *,
+                 shifted: bool) -> tuple[np.ndarray, list[str]]:
+    """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
+    if it is everywhere, where most stripes are read rightly all the same. `shifted`: whether it is said already that images have."""
+    sums = EvenSums.of(sample, collected, noise)
+    moved = np.zeros(mask.shape, bool)
+    if sums is None or not sums.moved(sample, noise).any():
+        return moved, []
+    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+        saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
+        part = sample._replace(values=planes.band(band), saturated=saturated)
+        moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
+    share = moved.sum() / mask.sum()
+    if share <= SAID:
+        return np.zeros_like(moved), []
+    clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
+    seen = f"frames[]: the even light of the frames differs at {100 * share:.2g} % of the pixels, as where "
+    if sums.everywhere:
+        return np.zeros_like(moved), [] if shifted else [
+            f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two patterns{clipped}: the "
+            "standard deviations do not hold what that makes; keep it still, or wait longer for each pattern"]
+    return moved, [f"{seen}something has moved during the sequence{clipped}: they are unsure"]

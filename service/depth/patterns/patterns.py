@@ -25,10 +25,10 @@ from service.depth.patterns.levels import check_levels
 from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_noise
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
-from service.depth.patterns.moved import SAID, EvenSums
+from service.depth.patterns.moved import moved_pixels
 from service.depth.patterns.pattern_checks import Sample, check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.projector_doubts import contradicted, widen
-from service.depth.patterns.readings import Readings
+from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
 from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.unseen_edges import measured_edge_error
 from service.depth.patterns.wave_checks import bent_back, check_waves
@@ -45,9 +45,6 @@ from stage.patterns.codes import Collected, collect
 from stage.patterns.kary import KaryCode
 from stage.stack.pattern_exposures import JoinedExposures, frames_shown
 from stage.stack.planes import Planes, frame_planes
-
-DECODE_BYTES_PER_PIXEL = 200
-"""Memory that decoding and triangulation take for each pixel, beside the planes."""
 
 
 class PatternCodes(NamedTuple):
@@ -121,7 +118,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, frames, noise, device, request,
                                      timings, declared=declared)
-        moved, said = _moved(planes, mask, sample, codes.collected, noise, shifted=coordinates.shift_px > 0)
+        moved, said = moved_pixels(planes, mask, sample, codes.collected, noise, shifted=coordinates.shift_px > 0)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
     warnings += said
@@ -206,30 +203,6 @@ def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, proje
         names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
         return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
     return Checks(said, codes, True)
-
-
-def _moved(planes: Planes, mask: np.ndarray, sample: Sample, collected: Collected, noise: NoiseModel, *,
-           shifted: bool) -> tuple[np.ndarray, list[str]]:
-    """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
-    if it is everywhere, where most stripes are read rightly all the same. `shifted`: whether it is said already that images have."""
-    sums = EvenSums.of(sample, collected, noise)
-    moved = np.zeros(mask.shape, bool)
-    if sums is None or not sums.moved(sample, noise).any():
-        return moved, []
-    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
-        saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
-        part = sample._replace(values=planes.band(band), saturated=saturated)
-        moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
-    share = moved.sum() / mask.sum()
-    if share <= SAID:
-        return np.zeros_like(moved), []
-    clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
-    seen = f"frames[]: the even light of the frames differs at {100 * share:.2g} % of the pixels, as where "
-    if sums.everywhere:
-        return np.zeros_like(moved), [] if shifted else [
-            f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two patterns{clipped}: the "
-            "standard deviations do not hold what that makes; keep it still, or wait longer for each pattern"]
-    return moved, [f"{seen}something has moved during the sequence{clipped}: they are unsure"]
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:

@@ -18,6 +18,9 @@ from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.stack.planes import Planes
 
+DECODE_BYTES_PER_PIXEL = 200
+"""Memory that decoding and triangulation take for each pixel, beside the planes."""
+
 
 class EvenLight(NamedTuple):
     """The rule that makes white and black of the phase frames of one period."""
