@@ -23,9 +23,10 @@ test: $(VENV)/installed-dev
 
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
 # and the kernels and products as on a GPU, on an emulated one, which takes what the others, who often wait, leave of the processors;
-# LONG_PART=2 takes of the long tests those of the third part of six alone
+# PART=2 takes of the long tests those of the third part of ten alone, and of those on the emulated device those of the third part of three
 test-all: $(VENV)/installed-dev
-	$(EMULATED) >$(VENV)/emulated.log 2>&1 & emulated=$$!; $(PYTEST) --durations=60 $(if $(LONG_PART),--long-part=$(LONG_PART)); tests=$$?; \
+	$(EMULATED) $(if $(PART),--part=$(PART)) >$(VENV)/emulated.log 2>&1 & emulated=$$!; \
+	  $(PYTEST) --durations=60 $(if $(PART),--part=$(PART)); tests=$$?; \
 	  wait $$emulated || tests=$$?; cat $(VENV)/emulated.log; exit $$tests
 
 # keeps what Python compiles of modules and tests

@@ -18,14 +18,16 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, lambda *_: None)
 
 
-LONG_PARTS = 6
-"""What .ci/run takes the long tests in, one part for each commit: all of them would take half an hour of two cores."""
+LONG_PARTS, EMULATED_PARTS = 10, 3
+"""What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all of them would take half an hour of
+two cores."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Let the tests of all devices run as on a machine with a GPU, and a part of the long tests alone."""
     parser.addoption("--device-emulated", action="store_true", help="run tests of devices, and no others, on an emulated cuda:0")
-    parser.addoption("--long-part", type=int, metavar="N", help=f"of the long tests run one of {LONG_PARTS} parts, by files")
+    parser.addoption("--part", type=int, metavar="N", help=f"of the long tests run one of {LONG_PARTS} parts, by files, and of those on the "
+                                                           f"emulated device one of {EMULATED_PARTS}, by tests")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -92,7 +94,7 @@ def is_long(item: pytest.Item) -> bool:
 
 
 def left_out(items: list[pytest.Item], part: int) -> list[pytest.Item]:
-    """Return the long tests of all files but every sixth, beginning with the file of this number modulo six."""
+    """Return the long tests of all files but every tenth, beginning with the file of this number modulo ten."""
     files = sorted({item.path for item in items if is_long(item)})
     chosen = set(files[part % LONG_PARTS::LONG_PARTS])
     return [item for item in items if is_long(item) and item.path not in chosen]
@@ -104,10 +106,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     Side by side these would wait for each other's processor time. Files with more long tests come first, so that at the end no process of
     the run is left with one of them.
     """
+    part = config.getoption("--part")
     if config.getoption("--device-emulated"):
         items[:] = [item for item in items if "device" in getattr(item, "fixturenames", ())]
-    if config.getoption("--long-part") is not None:
-        without = set(left_out(items, config.getoption("--long-part")))
+        items[:] = items if part is None else items[part % EMULATED_PARTS::EMULATED_PARTS]
+    elif part is not None:
+        without = set(left_out(items, part))
         items[:] = [item for item in items if item not in without]
         config.hook.pytest_deselected(items=list(without))
     groups: dict[str, list[pytest.Item]] = {}

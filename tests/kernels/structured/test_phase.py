@@ -15,6 +15,7 @@ from stage.patterns.base import uniform_patterns
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 from stage.patterns.phase import PhaseCode, phase_patterns
+from tests.marks import first_short
 from tests.reference import structured as reference
 from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
@@ -82,8 +83,7 @@ def test_sigma_is_that_of_the_error(steps, gain, device):
     assert ((coordinate - u)[ok] / sigma[ok]).std() == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.parametrize("periods", [
-    (17, 19, 23.5), (1024,), pytest.param((1000, 100, 12), marks=pytest.mark.long), pytest.param((40, 41.7), marks=pytest.mark.long)])
+@first_short("periods", [(1024,), (17, 19, 23.5), (1000, 100, 12), (40, 41.7)])
 def test_any_set_of_periods_is_the_most_likely_place(periods, device):
     patterns = phase_patterns("column", periods, 4)
     u = places(200, WIDTH)

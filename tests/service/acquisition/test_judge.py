@@ -50,6 +50,7 @@ def test_lamps_of_unequal_light_are_judged_by_what_the_rig_says_of_it():
     assert found == made
 
 
+@pytest.mark.long
 def test_the_highlight_of_a_glossy_ball_has_not_moved():
     """A highlight moves with the lamp, and lies in part where each of the lamps around has its own, as a prediction says."""
     directions = fibonacci_sphere(160)

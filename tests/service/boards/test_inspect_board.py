@@ -15,6 +15,7 @@ from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.significance import compare, scan_windows
 from service.boards.tiles import without_spikes
 from stage.formats import exr
+from tests.marks import first_short
 from tests.scenes.board import PIXEL, SIGMA, domes, scan, write_scan
 from tests.scenes.captures import write_exr
 from tests.scenes.depth import BLACK_WHITE, CAMERA, gray_patterns, make_scene, phase_patterns, write_patterns
@@ -259,7 +260,7 @@ def test_a_missing_chip_is_listed_as_large_and_deep_as_it_is():
     assert found[0].significance == pytest.approx(abs(found[0].deviation_m) / found[0].sigma_m)
 
 
-@pytest.mark.parametrize("changes", [{}, {"shared": 0.6}, {"outliers": 0.01}, {"warp": 3e-5},
+@first_short("changes", [{}, {"shared": 0.6}, {"outliers": 0.01}, {"warp": 3e-5},
                                      {"shared": 0.4, "outliers": 0.004, "warp": 1e-5}], ids=["noise", "shared", "outliers", "warp", "all"])
 def test_a_good_board_has_no_defect(changes):
     """Four boards: at 1 % false alarms, one in 25 sets of four would show one by chance."""

@@ -69,7 +69,8 @@ def inspected(relit, folder, views: list, *, sigma: float = SIGMA) -> dict:
     return json.loads((folder / "board" / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize("seed", [7, pytest.param(55, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [7, 55])
 def test_a_good_board_of_vertical_walls_has_no_defect(relit, tmp_path, seed):
     """Tiles that walls alone place, of which 13 in 18 such boards had defects beside them."""
     walls = components(2.4e-3, 2.2e-3, seed=seed, count=16)
@@ -85,6 +86,7 @@ def test_a_good_board_has_no_defect_where_noise_hides_its_slopes(relit, tmp_path
     assert found["comparison"]["shared"]["height_factor"]["value"] == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_depth_that_is_scaled_is_said_beside_its_defects(relit, tmp_path):
     bumps = domes(2.4e-3, 2.2e-3, seed=4)
     views = [scan(bumps, **STATION, seed=k) for k in (1, 2)]

@@ -142,6 +142,7 @@ def two_balls(folder, radii=(BALL_M, BALL_M)):
     return folder
 
 
+@pytest.mark.long
 def test_two_chrome_balls_are_found_and_give_positions(tmp_path):
     """A tenth of a pixel of outline or spot is 0.25°, 2 mm at 0.5 m; the rays meet at 20° to 30°, which doubles it and more."""
     folder = two_balls(tmp_path / "capture")

@@ -283,6 +283,7 @@ def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part):
     assert 0.8 < found[1].smallest_fault_m / found[0].smallest_fault_m < 1.2  # medians of 2000 points
 
 
+@pytest.mark.long
 def test_what_a_datum_leaves_open_keeps_the_σ_of_the_rest(tmp_path, part):
     """The plane below holds no shift along itself: the sides are as sure as the fit of all surfaces is."""
     made, design = part

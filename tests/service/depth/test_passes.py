@@ -9,6 +9,7 @@ import pytest
 from service.depth.scan import scan
 from service.requests.depth import ScanRequest
 from stage.errors import ImageError
+from tests.marks import first_short
 from tests.scenes.scanned_room import write_scan
 
 
@@ -17,7 +18,7 @@ def scanned(folder):
     return result.warnings, json.loads(result.report_path.read_text())["found"].get("passes")
 
 
-@pytest.mark.parametrize("right", [{}, {"noise": 0.05}, {"count": 8000}, {"noise": 0.0}])
+@first_short("right", [{}, {"noise": 0.05}, {"count": 8000}, {"noise": 0.0}])
 def test_passes_of_a_right_scan_lie_within_its_noise(tmp_path, right):
     warnings, passes = scanned(write_scan(tmp_path, **right))
     assert warnings == () and (passes is None or passes["apart_m"] < 2 * max(passes["within_m"], 1e-3))
@@ -25,21 +26,23 @@ def test_passes_of_a_right_scan_lie_within_its_noise(tmp_path, right):
         assert 0.003 < passes["within_m"] < 0.01  # ranges scatter by 1 cm, along rays that meet the walls aslant
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("wrong", "words"), [
     ({"inverted": True}, "the poses are platform_from_world"),
-    *(pytest.param({"factors": factors}, words, marks=pytest.mark.long) for factors, words in (
-        ((1, -1, 1, 1, 1), "azimuth_rad has the other sign"), ((1, 1, -1, 1, 1), "elevation_rad has the other sign"),
-        ((1, 1, 1, 1000, 1), "range_m is in millimetres"))),
+    ({"factors": (1, -1, 1, 1, 1)}, "azimuth_rad has the other sign"),
+    ({"factors": (1, 1, -1, 1, 1)}, "elevation_rad has the other sign"),
+    ({"factors": (1, 1, 1, 1000, 1)}, "range_m is in millimetres"),
 ], ids=["poses", "azimuth", "elevation", "millimetres"])
 def test_another_sign_unit_or_sense_is_named(tmp_path, wrong, words):
     (warning,), passes = scanned(write_scan(tmp_path, **wrong))
     assert words in warning and passes["apart_m"] > 2 * passes["within_m"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("wrong", "pattern", "size"), [
-    pytest.param({"late_s": -0.2}, r"if ([0-9.]+) s are taken off time_s", 0.2, marks=pytest.mark.long),
+    ({"late_s": -0.2}, r"if ([0-9.]+) s are taken off time_s", 0.2),
     ({"late_s": 0.1}, r"if ([0-9.]+) s are added to time_s", 0.1),
-    pytest.param({"turned": 2.0}, r"platform_from_scanner is turned by ([0-9.]+)°", 2.0, marks=pytest.mark.long),
+    ({"turned": 2.0}, r"platform_from_scanner is turned by ([0-9.]+)°", 2.0),
 ], ids=["clock early", "clock late", "mounting"])
 def test_a_clock_or_a_mounting_that_is_off_is_measured(tmp_path, wrong, pattern, size):
     """To a twentieth: by some thousand places with a noise of 1 cm, which the fault moves by several."""

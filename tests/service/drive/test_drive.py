@@ -13,6 +13,7 @@ from stage.formats import exr
 from stage.rig.chart import read_chart
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
+from tests.marks import first_short
 from tests.scenes.captures import write_exr
 from tests.scenes.rigs import NORMALS, SUN, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
 from tests.service.owl import write_small_owl
@@ -64,7 +65,7 @@ def test_a_sun_between_two_lamps_is_shared_by_them(drive, tmp_path):
     assert levels["L003", "red"] > 0.4
 
 
-@pytest.mark.parametrize("kind", ["sun", "overcast", "patches"])
+@first_short("kind", ["sun", "overcast", "patches"])
 @pytest.mark.parametrize("count, bound, off", [pytest.param(331, 0.01, 0.0025, marks=pytest.mark.long), (128, 0.03, 0.005)])
 def test_the_sphere_of_normals_receives_the_light_of_the_sky(drive, tmp_path, count, bound, off, kind):
     """A sun from between lamps is spread over them, which 1 % and 3 % allow; the best that these lamps can do at all is found by NNLS."""
@@ -94,6 +95,7 @@ def test_it_is_nearer_than_sampling_an_eight_bit_panorama_at_the_lamps(drive, tm
     assert rms(np.maximum(NORMALS @ directions.T, 0) @ sampled, truth) > 5 * rms(lamps_irradiance(rig, levels), truth)
 
 
+@pytest.mark.long
 def test_eight_bits_add_little(drive, tmp_path):
     """Half a per cent of the irradiance at most: what rounding leaves over goes to neighbours."""
     for bits in (8, 16):
@@ -153,6 +155,7 @@ def test_colours_that_the_lamps_lack_are_said_as_a_part_of_the_light(relit, tmp_
     assert "miss up to 67%" in outcome.out
 
 
+@pytest.mark.long
 def test_a_chart_is_shown_and_judged_under_both_lights(drive, tmp_path):
     """Under a white sky the irradiance is π: readings of the patches follow in closed form, and from the levels for the lamps.
 
@@ -179,6 +182,7 @@ def test_a_chart_is_shown_and_judged_under_both_lights(drive, tmp_path):
     assert shown > plain
 
 
+@pytest.mark.long
 def test_the_levels_light_the_owl_as_relight_does(relit, drive, tmp_path):
     """Sums of the captured images at the levels of a rig made of the capture, of 16 bits: within a thousandth of relit relight."""
     owl_capture = write_small_owl(tmp_path / "owl", 4)

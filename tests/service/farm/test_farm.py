@@ -18,6 +18,7 @@ from service.requests.base.options import options_of
 from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
 from stage.formats import exr
+from tests.marks import first_short
 from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 from tests.scenes.glossy import dome, write_dome, write_maps
 
@@ -107,7 +108,7 @@ def test_a_turn_of_pictures(relit, tmp_path, monkeypatch):
 
 
 @needs_openjd
-@pytest.mark.parametrize("command", ["relight", "relight guided", "shade", "shade captured"])
+@first_short("command", ["relight", "relight guided", "shade", "shade captured"])
 def test_every_template_is_valid(relit, tmp_path, command):
     """With every option there is; and every path is said to be read or written, so that a farm can bring it and take it away."""
     write_dome(tmp_path / "cap", dome(size=12), lights=12)

@@ -17,6 +17,7 @@ from service.joining.depth_and_normals import Joined, join_depth
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.scenes.joined import MM, View, degrees_between, drifting, see
 
 LEAST_RATIO, NORMAL_RATIO = 0.5, 1.1
@@ -37,7 +38,7 @@ def join(view: View, *, noise: float, drift: float, sigma: float, device: str, s
     return joined, given
 
 
-@pytest.mark.parametrize("perspective", [False, True])
+@first_short("perspective", [False, True])
 @pytest.mark.parametrize(("noise", "drift", "sigma"), [
     (2, 3, 0.1 * MM), (0.5, 2, 0.5 * MM),
     *(pytest.param(*more, marks=pytest.mark.long) for more in ((0.5, 0, 0.5 * MM), (0.2, 4, 2 * MM)))])
@@ -71,7 +72,7 @@ def ripple(depth):
     return depth + MM * np.sin(np.arange(depth.shape[1]) / 9)
 
 
-@pytest.mark.parametrize(("depth", "normals", "most"), [
+@first_short(("depth", "normals", "most"), [
     (lambda depth: depth + 4 * SIGMA * np.random.default_rng(7).standard_normal(depth.shape), 1.0, 0.2 * MM),
     (ripple, 2.0, 0.5 * MM),
     (lambda depth: np.round(depth / (2 * MM)) * 2 * MM, 2.0, 0.2 * MM),
@@ -89,7 +90,7 @@ def test_a_depth_that_is_worse_than_its_sigma_says_neither_bends_normals_nor_is_
     assert np.median(error / joined.sigma[sure]) < 1.4 and np.mean(error > 5 * joined.sigma[sure]) < 0.1
 
 
-@pytest.mark.parametrize("factor", [1.0, 0.7, 1.3])
+@first_short("factor", [1.0, 0.7, 1.3])
 def test_normals_that_are_too_flat_or_too_steep_everywhere_get_the_relief_of_the_depth(device, factor):
     """Slopes of 0.7 or 1.3 times the true ones, which are 4 to 5° off; what is left is the noise of 0.5° and drift of 1°."""
     given = drifting(WAVE.normal, noise=NOISE, drift=1) * np.array([factor, factor, 1.0])[:, None, None]

@@ -7,6 +7,7 @@ from service.light_estimation.explanations import Cause, Sample, better_explanat
 from service.light_estimation.lambertian import fit_lambertian, median_of, suspects
 from service.light_estimation.semi_calibrated import check_directions, fit_intensities, part_uncertainty
 from stage.errors import CalibrationError
+from tests.marks import first_short
 from tests.scenes.captures import angles_degrees, ring
 from tests.scenes.ellipsoid import ellipsoid
 from tests.service.calibrate.solvers.balls import spread, unit
@@ -55,7 +56,7 @@ def test_noise_is_averaged_and_stated():
     assert 0.05 < np.sqrt((error**2).mean()) / part_uncertainty(*given, found.irradiance).mean() < 1
 
 
-@pytest.mark.parametrize("material", ["rough", "flat", "velvet"])
+@first_short("material", ["rough", "flat", "velvet"])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_the_stated_uncertainty_holds_what_other_reflection_than_lamberts_makes(material, seed):
     """A broad lobe, light that falls by the power 0.8 of the cosine, and a rim: lights are 1 to 10 % off, and were sure to 0.05 %."""

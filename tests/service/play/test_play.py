@@ -25,6 +25,7 @@ from service.twin.listener import Listener
 from stage.errors import ManifestError
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import read_rig
+from tests.marks import first_short
 from tests.scenes.captures import ring
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
 
@@ -142,7 +143,7 @@ def test_a_held_frame_stays_until_the_show_is_stopped(tmp_path):
     assert values[:4] == [0, 2, 2, 2] and set(values) == {0, 2} and values[-1] == 0
 
 
-@pytest.mark.parametrize("protocol", ["sacn", "artnet"])
+@first_short("protocol", ["sacn", "artnet"])
 def test_a_slow_show_keeps_its_source_alive(tmp_path, monkeypatch, protocol):
     monkeypatch.setattr(module, "KEEP_ALIVE_S", 0.1)
     found = played(tmp_path, counted_steps(2, 12), 4, 2, protocol, frames_per_second=2)

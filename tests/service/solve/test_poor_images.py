@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.scenes.captures import Scene, angles_degrees, render, ring, write_capture
 
 RNG = np.random.default_rng(41)
@@ -28,7 +29,7 @@ def test_thin_images_are_solved(relit, tmp_path, shape, method):
     assert maps.mask.all() and angles_degrees(maps.normal, scene.normal).max() < 0.1  # half rounding of nine readings
 
 
-@pytest.mark.parametrize("method", ["lambert", "robust", "svbrdf"])
+@first_short("method", ["robust", "lambert", "svbrdf"])
 def test_a_lamp_in_the_picture(relit, tmp_path, method):
     """Its albedo is beyond half floats: the maps are readable, and the others are right to the half rounding of nine readings."""
     scene = waves(20, 30, 9)

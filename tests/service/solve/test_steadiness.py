@@ -39,7 +39,8 @@ def warnings(folder, said="image to image", **scene):
     return [warning for warning in solved(folder, **scene)[0] if said in warning]
 
 
-@pytest.mark.parametrize("shake_px", [0.2, pytest.param(0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("shake_px", [0.2, 0.5])
 def test_a_camera_that_shakes_is_named(tmp_path, shake_px):
     """With a move that is not beyond that of the images, √2 times as far as along an axis, and at least half of it while it is small."""
     found, = warnings(tmp_path, shake_px=shake_px)
@@ -58,7 +59,8 @@ def test_without_texture_nothing_tells(tmp_path):
     assert not warnings(tmp_path, shake_px=0.5, contrast=0.0)
 
 
-@pytest.mark.parametrize("drift_px", [0.4, pytest.param(0.8, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("drift_px", [0.4, 0.8])
 def test_a_drift_with_the_light_is_named_and_held_by_sigma(tmp_path, drift_px):
     """Texture turns the normals, and leaves no residual; without what the curl tells, 4 % of them are off by more than five σ."""
     said, ratio = solved(tmp_path, drift_px=drift_px)

@@ -6,6 +6,7 @@ import pytest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.formats import exr
+from tests.marks import first_short
 from tests.scenes.captures import write_image
 from tests.scenes.translucent import Body, write
 
@@ -31,13 +32,14 @@ def test_normals_of_translucent_bodies_are_as_unsure_as_they_are_wrong(tmp_path,
     assert (ratio > 5).mean() < 0.02
 
 
-@pytest.mark.parametrize("body", [Body(), Body(lens_px=0.9), Body(bounced=(0.3, 0.2, 0.1)), Body(lens_px=0.6, bounced=(0.4, 0.2, 0.05))],
+@first_short("body", [Body(), Body(lens_px=0.9), Body(bounced=(0.3, 0.2, 0.1)), Body(lens_px=0.6, bounced=(0.4, 0.2, 0.05))],
                          ids=["sharp", "blurred by the lens", "in bounced light", "both"])
 @pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
 def test_opaque_bodies_are_not_taken_for_translucent_ones(tmp_path, body, seed):
     assert "translucent" not in solved(tmp_path, body, seed=seed)[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("body", "noise"), [(Body(albedo=(0.6, 0.2, 0.03)), 0.01),
                                              (Body(albedo=(0.6, 0.3, 0.08), bounced=(0.5, 0.3, 0.1)), 0.02)])
 def test_noise_makes_no_sharp_edges_of_the_darker_colour(tmp_path, body, noise):

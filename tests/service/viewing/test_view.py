@@ -65,6 +65,7 @@ def test_the_owl(relit, tmp_path):
     assert (tmp_path / "out" / "view.json").stat().st_size < 1e6 and (tmp_path / "out" / "thumbnails.jpg").stat().st_size < 2e6
 
 
+@pytest.mark.long
 def test_the_card_shows_the_object_lit_from_where_the_grid_says(relit, tmp_path):
     assert relit("view", ROOT / "samples" / "lambert", "--cache", tmp_path / "cache", "--out", tmp_path).code == 0
     picture, sheet = (oiio.ImageBuf(str(tmp_path / name)).get_pixels(oiio.UINT8) for name in ("card.jpg", "card_lights.jpg"))

@@ -11,6 +11,7 @@ from kernels.photometric.gradient.moments import fit_moments
 from kernels.photometric.gradient.separation import HIDDEN_TILT, separate_by_colour, separate_polarised
 from kernels.status import Status
 from tests.kernels.scenes import GREY, HALF_ROUNDING, angle_degrees, bits, cap, colours, store
+from tests.marks import first_short
 from tests.reference import gradient as reference
 
 PAIRS = tuple((axis, sign) for axis in "xyz" for sign in (1, -1))
@@ -119,7 +120,7 @@ def test_contradiction_and_occlusion_raise_the_standard_error(device):
 
 
 @pytest.mark.parametrize("f0", [0.04, 0.6])
-@pytest.mark.parametrize(("roughness", "lean"), [
+@first_short(("roughness", "lean"), [
     (0.1, (0.04, 0.03)), (0.3, (0.38, 1.37)), (0.7, (9.9, 16.2)),
 ])
 def test_polarisation_tells_diffuse_and_specular_apart(device, roughness, lean, f0):

@@ -10,6 +10,7 @@ from kernels.photometric.material.material import Material
 from tests.kernels.photometric.material.test_metal_energy import blurred
 from tests.kernels.photometric.material.test_mixtures import GOLD, metal
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
+from tests.marks import first_short
 from tests.scenes.glossy import sphere_directions
 
 COUNT = 200
@@ -37,7 +38,7 @@ def test_the_light_that_a_material_loses(device, count):
     assert (account_light(paint, NORMAL, matt).misread > 0).mean() < 0.15
 
 
-@pytest.mark.parametrize(("count", "turn"), [(128, 16.0), (128, 30.0), (64, 30.0)])
+@first_short(("count", "turn"), [(128, 16.0), (128, 30.0), (64, 30.0)])
 def test_normal_and_f0_of_a_metal_that_turns_within_a_pixel(device, count, turn):
     """Lights stand 18° apart (128) or 25°, half vectors half as far, of which the normal is a mean; a sixth is asked of the spacing of
     the lights. F0 is a sum over few lights: 15 %. The lobe is at least as wide as the material's. σ holds the errors."""

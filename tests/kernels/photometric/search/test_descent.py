@@ -103,6 +103,7 @@ def test_it_costs_no_more_than_rings(device):
     assert found.cost.mean() < 1.01 * rings.cost.mean()
 
 
+@pytest.mark.long
 def test_the_curvature_is_that_of_the_cost(device):
     """The mean rise of the twin's cost at half a degree, on readings that the model explains: within a quarter in the median, because the
     second derivative of the robust cost is not that of its weighted squares."""

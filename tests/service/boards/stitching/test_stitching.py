@@ -6,6 +6,7 @@ import pytest
 from service.boards.stitching.grid import BLOCK_PX, blocks_of, robust_sigma
 from service.boards.stitching.stitching import TilePoints, blend, stitch
 from stage.errors import BoardError
+from tests.marks import first_short
 from tests.scenes.board import PIXEL, SIGMA, View, components, domes, scan
 
 SIDE, STEP = (120, 130), (1.0e-3, 0.9e-3)
@@ -44,7 +45,7 @@ def errors(surface, views: list[View], stitched, heights) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("surface", "options"), [
+@first_short(("surface", "options"), [
     (domes(4e-3, 4e-3), {"turn": 3e-4, "stage": 3e-5}),
     (domes(4e-3, 4e-3, jitter=0.0), {}),
     (domes(4e-3, 4e-3, seed=5, bow=2e-4), {"missing": 0.1}),

@@ -10,6 +10,7 @@ from service.depth.base.epipolar import contradiction
 from service.depth.patterns.projector_doubts import ALIKE, LEAST_PX
 from stage.capture.projector import Projector
 from stage.results.depth_maps import DepthMaps
+from tests.marks import first_short
 from tests.scenes.captures import write_image
 
 SIZE, FOCAL, PROJECTED, LENS = (150, 110), 170.0, (200, 150), 230.0
@@ -82,7 +83,7 @@ def judged(rig, wrong, noise, *, stripes=0.0, seed=3):
     return told, np.linalg.norm(found - points, axis=-1).ravel(), None if told is None else np.hypot(*told.moved(flat))
 
 
-@pytest.mark.parametrize("stripes", [0.0, 1.0, 4.0])
+@first_short("stripes", [0.0, 1.0, 4.0])
 @pytest.mark.parametrize("rig", RIGS)
 def test_right_calibrations_raise_no_doubt(rig, stripes):
     for seed in range(4):
@@ -133,7 +134,7 @@ def written(folder, wrong):
     return -points[..., 2]
 
 
-@pytest.mark.parametrize("wrong", [None, "yaw", "roll"])
+@pytest.mark.parametrize("wrong", [None, "yaw", pytest.param("roll", marks=pytest.mark.long)])
 def test_depth_says_it(relit, tmp_path, wrong):
     depth = written(tmp_path, wrong)
     outcome = relit("depth", tmp_path, "--out", tmp_path / "out", "--device", "cpu", "--read-noise", "0.003")

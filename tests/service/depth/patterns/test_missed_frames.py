@@ -7,6 +7,7 @@ import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
+from tests.marks import first_short
 from tests.scenes.captures import write_exr, write_image
 from tests.scenes.depth import AMBIENT, BLACK_WHITE, gray_patterns, make_scene, manifest, phase_patterns, shown
 
@@ -61,7 +62,7 @@ def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, pattern
     assert f"{number:02d}.exr and {number - 1:02d}.exr show the same" in said[0] and not solved.any()
 
 
-@pytest.mark.parametrize("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
+@first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
 @pytest.mark.parametrize("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
                          ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
                               "one wave"])

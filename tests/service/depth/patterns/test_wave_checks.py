@@ -12,6 +12,7 @@ from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.depth.patterns.wave_range import check_range
 from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns
+from tests.marks import first_short
 
 EXTENT, ROW_EXTENT, ROWS, COLS = 400, 300, 24, 150
 NOISE = NoiseModel(0.004, 1e-4)
@@ -116,7 +117,7 @@ def test_waves_of_the_rows_keep_what_is_said_of_the_columns(periods):
     assert wrong is None and unconfirmed.startswith("frames[].pattern: the column phases run")
 
 
-@pytest.mark.parametrize("gamma", [1.5, 2.1])
+@first_short("gamma", [1.5, 2.1])
 def test_bent_waves_are_bent_back_by_the_exponent_that_makes_them_agree(gamma):
     """Grid of 0.05 in the exponent; what is left is that of half a step, 0.004 rad, and noise."""
     wrong, _, found = said(THREE, THREE, gamma=gamma)
@@ -125,7 +126,7 @@ def test_bent_waves_are_bent_back_by_the_exponent_that_makes_them_agree(gamma):
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.8])
-@pytest.mark.parametrize("declared", [250, 320, EXTENT, 500])
+@first_short("declared", [250, 320, EXTENT, 500])
 def test_waves_that_go_on_beyond_the_projector_are_named(declared, gamma):
     """A projector of 400 columns, seen from about 20 to 390; the waves repeat after 5 434."""
     sample, projector = frames_of(THREE, gamma=gamma), PatternProjector((declared, ROW_EXTENT))

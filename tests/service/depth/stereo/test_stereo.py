@@ -121,7 +121,8 @@ WRONG = {
 """Fields of another camera: off by half to one and a half pixels of its image."""
 
 
-@pytest.mark.parametrize("wrong", [key if key == "yaw" else pytest.param(key, marks=pytest.mark.long) for key in WRONG])
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_calibration_is_named_and_sigma_holds_it(relit, tmp_path, wrong):
     """Without it, all but a few in a hundred depths under the wrong yaw were off by more than five σ, without a word. The bounds: σ of one
     error that all depths share holds it but for one in twenty such scenes."""

@@ -13,6 +13,7 @@ from service.relight.weights.triangulation import share_smooth
 from service.relight.weights.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 from tests.reference.relight import best_weights, matern, rotation_about_y, samples, texel_directions, texel_solid_angles
 
 ROUNDING = 1e-9
@@ -51,7 +52,7 @@ def test_no_other_weights_that_are_not_negative_expect_less_error(seed):
     np.testing.assert_allclose(given, best_weights(towards, energy[:, 0], directions), atol=ROUNDING)
 
 
-@pytest.mark.parametrize("directions", [scattered(300, 3), cap(128, 180), DOME])
+@first_short("directions", [scattered(300, 3), cap(128, 180), DOME])
 def test_many_lights_meet_the_conditions_of_the_best_weights(directions):
     """Karush, Kuhn and Tucker: the derivative of the expected error is the same at all lights in use, and no less at the others."""
     towards = directions[::17] + 0.05 * scattered(len(directions[::17]), 9)
@@ -83,7 +84,7 @@ def test_symmetric_lights_share_an_even_sky_equally(directions):
     assert given.sum(axis=0) == pytest.approx(2.5 * texel_solid_angles(90, 180).sum(), rel=SUM)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@first_short("seed", range(3))
 @pytest.mark.parametrize("lights, part", [(cap(60, 180), 0.1), (None, 0.75)], ids=["even", "scattered"])
 def test_shading_is_integrated_more_exactly_than_by_cells_and_smooth(lights, part, seed):
     """Truth: ∫ L (1 + n·ω)³ dω over the texels, for 20 normals. Scattered lights leave holes, whose light is shared as by smooth."""

@@ -35,6 +35,7 @@ def test_captures_are_created_looked_at_deleted_and_listed_in_pages(client):
     assert all(item["id"].startswith("env_") for item in client.get("/v1/environments").json()["items"])
 
 
+@pytest.mark.long
 def test_a_registered_capture_is_checked_at_once_and_stays_where_it_lies(server, client, registered):
     folder = write_capture(registered / "kept")
     ready = admitted(server, client, folder)
@@ -114,9 +115,9 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     database.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "more"), [
-    ("solve", {}), *(pytest.param(kind, more, marks=pytest.mark.long) for kind, more in (
-        ("depth", {}), ("scan", {"options": {"near_m": 1}}), ("basis", {}), ("inspect-board", {}), ("calibrate-saturation", {})))])
+    ("solve", {}), ("depth", {}), ("scan", {"options": {"near_m": 1}}), ("basis", {}), ("inspect-board", {}), ("calibrate-saturation", {})])
 def test_a_job_whose_registered_capture_is_gone_does_not_say_where_it_was(server, client, gone, kind, more):
     job = submit(client, kind=kind, capture=gone[0], **more)
     error = finish(server, client, job, "failed")["error"]

@@ -141,6 +141,7 @@ def test_a_broken_connection_keeps_what_needs_no_check(server, tus, capture, che
     assert stored(server, capture, "file.bin").read_bytes() == content
 
 
+@pytest.mark.long
 def test_an_upload_is_written_by_one_request_at_a_time(server, tus, capture):
     content = random.Random(4).randbytes(2 * MIB)
     upload = begun(tus, capture, len(content))

@@ -14,6 +14,7 @@ from service.server.jobs.steps import steps_of
 from service.server.storage import layout
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import open_storage
+from tests.marks import first_short
 from tests.scenes.foreign import write_photographs
 from tests.service.server.jobs.harness import PROJECT
 
@@ -83,7 +84,7 @@ def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harn
 
 
 @ON_SQLITE
-@pytest.mark.parametrize("limit", ["max_project_bytes", "max_project_pixels"])
+@first_short("limit", ["max_project_bytes", "max_project_pixels"])
 def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_harness, uploaded, limit):
     """The photographs have 9 × 32 × 32 pixels, and capture.json some hundred bytes."""
     identifier, names = uploaded

@@ -18,6 +18,7 @@ from service.server.storage import layout
 from service.server.storage.objects import open_storage
 from stage.errors import StorageError
 from stage.files import write_text
+from tests.marks import first_short
 from tests.service.server.jobs.harness import PROJECT
 
 NO_ANSWER = OperationalError("SELECT 1", {}, Exception("the server is away"))
@@ -80,7 +81,7 @@ def test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left(idle_har
     (RuntimeError("Failed to allocate 4096 bytes on device 'cpu'"), "the worker has too little memory"),
     (MemoryError(), "the worker has too little memory"),
 ])
-@pytest.mark.parametrize("when", ["before the first step", "in a step"])
+@first_short("when", ["before the first step", "in a step"])
 def test_an_unexpected_error_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch, error, told, when):
     made, claim = runner
 

@@ -90,7 +90,8 @@ def test_the_warnings_tell_shadows_that_contradict_each_other_from_none():
     assert parts[1].facts()["contradiction"] == 0.5 and "contradiction" not in parts[2].facts()
 
 
-@pytest.mark.parametrize("radius", [0.08, pytest.param(0.11, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("radius", [0.08, 0.11])
 def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_path):
     """Three pixels in radius, so that normals turn by 20 to 30° from pixel to pixel. Cut at all of these turns, nothing of it was a part.
 
@@ -105,7 +106,8 @@ def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_pat
     assert report["found"]["unexplained_shadows"] < 0.02
 
 
-@pytest.mark.parametrize("gap", [0.75, pytest.param(1.1, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("gap", [0.75, 1.1])
 def test_a_wire_that_loses_its_step_is_named_by_its_shadows(gap, tmp_path):
     """Two pixels thick: no part, so that the height leaves it near the body. Its shadows fall where that height throws none."""
     wire = Part((0.05, 0.1, gap), (0.5, 0.035, 0.035))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.reference import microfacet
 from tests.scenes.captures import Scene, angles_degrees, write_capture
 from tests.scenes.glossy import VIEW, dome, sphere_directions
@@ -65,7 +66,7 @@ def test_one_of_five_lights_twice_as_bright_as_declared(relit, tmp_path):
     assert np.median(error / sigma) < 1.4  # the bar of docs/trust.md, whether the fit has left the light out or not
 
 
-@pytest.mark.parametrize(("lights", "gloss"), [(5, 0.0), (9, 0.4), (14, 0.2)])
+@first_short(("lights", "gloss"), [(5, 0.0), (9, 0.4), (14, 0.2)])
 def test_nothing_is_said_of_right_lights(relit, tmp_path, lights, gloss):
     _, _, said = solve(relit, tmp_path, hills(lights, gloss=gloss))
     assert "look near" not in said and "as bright as declared" not in said

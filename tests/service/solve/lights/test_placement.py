@@ -41,7 +41,8 @@ def test_lights_that_stand_where_they_are_declared_raise_no_doubt(relit, tmp_pat
     assert np.median(error) < 1 and report["warnings"] == [] and "light_placement" not in report["found"]
 
 
-@pytest.mark.parametrize("how", ["aside", *(pytest.param(how, marks=pytest.mark.long) for how in list(MOVED)[1:])])
+@pytest.mark.long
+@pytest.mark.parametrize("how", MOVED)
 def test_lights_that_are_moved_are_named_and_sigma_holds_it(relit, tmp_path, how):
     """Without it the normals were up to four σ off, without a word."""
     error, sigma, report = solved(relit, tmp_path, MOVED[how])
@@ -69,7 +70,8 @@ def test_too_few_lights_are_refused(relit, tmp_path):
     relit("solve", tmp_path, "--out", tmp_path / "out", "--lights", "refined").refused("4 near lights do not tell where they stand")
 
 
-@pytest.mark.parametrize("lights", ["declared", pytest.param("refined", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("lights", ["declared", "refined"])
 def test_a_rig_that_is_turned_is_named_and_turned_back(relit, tmp_path, lights):
     """By 8° about a horizontal axis through the object. Without it the normals were 10 to 25 σ off, without a word."""
     centre, turn = DOME.points[DOME.mask].mean(axis=0), Rotation.from_rotvec([8, 0, 0], degrees=True)

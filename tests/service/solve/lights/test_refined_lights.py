@@ -31,7 +31,8 @@ def solved(tmp_path, scene, directions, lights="refined", **options):
 
 
 # √(9/2n) of independent errors is left: 0.39 and 0.61
-@pytest.mark.parametrize(("count", "part"), [(LIGHTS, 0.5), pytest.param(12, 0.7, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "part"), [(LIGHTS, 0.5), (12, 0.7)])
 def test_errors_of_five_degrees_are_refined(tmp_path, count, part):
     scene = ellipsoid(count=count)
     rough = turned(scene.directions, 5)
@@ -45,6 +46,7 @@ def test_errors_of_five_degrees_are_refined(tmp_path, count, part):
     assert np.median(result.maps.sigma[result.maps.estimated]) > told["left_degrees"]
 
 
+@pytest.mark.long
 def test_right_directions_stay(tmp_path):
     scene = ellipsoid(count=LIGHTS)
     _, report, _ = solved(tmp_path, scene, scene.directions)
@@ -62,6 +64,7 @@ def test_what_all_lights_have_wrong_together_stays(tmp_path):
     assert np.mean(angles_degrees(np.array(report["found"]["refined_lights"]["directions"]), scene.directions @ turn.T)) < 1
 
 
+@pytest.mark.long
 def test_one_wrong_light_is_put_right_and_named(tmp_path):
     scene = ellipsoid(count=LIGHTS)
     degrees = np.zeros(LIGHTS)

@@ -62,7 +62,8 @@ def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how
     assert np.median(error) > 2 and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
 
 
-@pytest.mark.parametrize("name", ["few lights", pytest.param("glossy", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["few lights", "glossy"])
 def test_lights_are_turned_back(tmp_path, name):
     error, sigma, report = solved(tmp_path, name, TURNS["tilted"], "refined")
     right, _, _ = solved(tmp_path / "right", name, (0, 0, 0))

@@ -55,7 +55,8 @@ def relief(seed, *, shadows, size=96):
     return Scene(normal, albedo, np.ones_like(x, bool), directions, np.full((LIGHTS, 3), np.pi), np.maximum(noisy, 0))
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_cast_shadows_tell_bumps_from_hollows(tmp_path, seed):
     """Weak highlights leave the depth and tilt open, with a wide σ; but the inverse, taken as often before, is never nearer."""
     scene = relief(seed, shadows=True)
@@ -65,7 +66,8 @@ def test_cast_shadows_tell_bumps_from_hollows(tmp_path, seed):
     assert np.mean(error) < np.mean(inverse) and not any("bumps from hollows" in words for words in result.warnings)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_where_nothing_tells_bumps_from_hollows_sigma_holds_both(tmp_path, seed):
     """Normals are off by nothing or by twice their tilt."""
     scene = relief(seed, shadows=False)
@@ -119,6 +121,7 @@ def test_the_report_says_that_the_manifest_has_other_lights(glossy):
     assert any("found.unknown_lights" in warning for warning in result.warnings)
 
 
+@pytest.mark.long
 def test_a_matt_object_of_one_albedo_is_told_by_it_and_doubted(tmp_path):
     scene = ellipsoid(count=LIGHTS)
     even = np.where(scene.albedo > 0, scene.images / np.maximum(scene.albedo, 1e-9) * 0.4, 0)

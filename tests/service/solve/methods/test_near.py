@@ -107,6 +107,7 @@ def test_lamps_that_shine_forward(relit, tmp_path, exponent):
     assert height_error(maps, ORTHOGRAPHIC).max() > 0.02
 
 
+@pytest.mark.long
 @DOMES
 def test_near_and_distant_lights_together(relit, tmp_path, dome):
     lights = [far(lamp, dome) if index % 2 else lamp for index, lamp in enumerate(lamps(dome, 32, RADII))]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from stage.formats import exr
+from tests.marks import first_short
 from tests.reference import sampling as twin
 from tests.scenes import horn
 from tests.scenes.captures import angles_degrees
@@ -94,7 +95,7 @@ def test_a_perspective_view_is_solved_in_parts(relit, tmp_path):
     assert (maps.regime[BALL.mask] == np.where(PAINTED, 1, 3))[facing].mean() > 0.99
 
 
-@pytest.mark.parametrize("method", ["lambert", "robust"])
+@first_short("method", ["lambert", "robust"])
 def test_methods_for_one_direction_refuse(relit, tmp_path, half_painted, method):
     write_sampling(tmp_path, BALL, half_painted, CENTRES)
     outcome = relit("solve", tmp_path, "--out", tmp_path / "out", "--method", method)
