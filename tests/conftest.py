@@ -19,15 +19,14 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
 
 
 LONG_PARTS, EMULATED_PARTS = 10, 3
-"""What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all of them would take half an hour of
-two cores."""
+"""What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all would take an hour of two cores."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Let the tests of all devices run as on a machine with a GPU, and a part of the long tests alone."""
     parser.addoption("--device-emulated", action="store_true", help="run tests of devices, and no others, on an emulated cuda:0")
-    parser.addoption("--part", type=int, metavar="N", help=f"of the long tests run one of {LONG_PARTS} parts, by files, and of those on the "
-                                                           f"emulated device one of {EMULATED_PARTS}, by tests")
+    parser.addoption("--part", type=int, metavar="N", help=f"of the long tests run one of {LONG_PARTS} parts, by files, and of those "
+                                                           f"on the emulated device one of {EMULATED_PARTS}, by tests")
 
 
 def pytest_configure(config: pytest.Config) -> None:
