@@ -19,7 +19,7 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
 
 
 LONG_PARTS, EMULATED_PARTS = 10, 3
-"""What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all would take an hour of two cores."""
+"""What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all take an hour."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -81,7 +81,7 @@ def trials(data: Path | None) -> Iterator[Trial]:
         for name in CODES if not words else ("Gray, inverses", "binary, white and black", "k-ary, plain", "ramps",
                                                     "phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
             yield _run(f"{name}{words}", True, world, CODES[name], light)
-    for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "ramps"):
+    for name in ("Gray, inverses", "phase 16, 4 steps, Gray", "phase 16/18/21, 3 steps", "ramps", "modulated"):
         yield _run(f"{name}, noise of {100 * NOISY:g} % declared as {100 * NOISES[''][0]:g}", False, World(shapes=SHELF, read_noise=NOISY),
                    CODES[name], light, read_noise=NOISES[""][0])
     yield _run("Gray, inverses, images of points", False, World(shapes=SHELF, samples=1, blur_px=0.0), GRAY)

@@ -1,52 +1,99 @@
-"""The noise of the frames by themselves: sums of frames that are the same even light differ by noise alone.
+"""The noise of the frames by themselves: frames, or sums of them, that are the same light at a pixel differ by noise alone.
 
 A bit and its inverse, a wave over its shifts, a ramp and the opposite one, white and black: their means are the light half way between
-white and black, at every pixel. What changes smoothly between two of them (lamps that age, light below surfaces) is taken off by second
-differences along image rows.
+white and black. A bit without an inverse is white or black where it is lit or dark: it tells the noise of waves beside it, while stripes
+alone are read rightly in far more noise than is declared. What changes smoothly between two of these (lamps that age, light below
+surfaces, waves that the projector bends) is taken off by second differences along image rows or columns: waves are straight along their
+stripes.
 """
 
+from collections.abc import Iterator
 from itertools import pairwise
+from math import ceil
 
 import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.patterns.levels import HALVES, even_means, row_of
-from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.levels import COARSE, HALVES, even_means, row_of
+from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART
+from service.depth.patterns.readings import line_readings
+from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
+from stage.patterns.modulated import ModulatedCode
+from stage.patterns.phase import PhaseCode
 from stage.spread import MAD_TO_SIGMA
+from stage.stack.planes import Planes
 
-UNBENT_STEPS = 4
-"""Number of shifts from which on the mean of a wave is even light even where the projector's response bends it: that of three is not."""
+TRIPLES = 32
+"""Number of groups of three neighbouring image rows that are looked at, evenly spread."""
+LIT_SIGMAS = 20.0
+"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that tell noise."""
+CLEAR = 0.25
+"""Distance from white or black, as a part of their difference, within which a bit is lit or dark."""
 NOISIER, SAID_NOISIER = 1.25, 2.0
 """Noise in the noise that is declared from which on it is taken instead, and from which on that is said."""
 
 
-def with_measured_noise(sample: Sample, collected: Collected, noise: NoiseModel) -> tuple[NoiseModel, float]:
+def with_measured_noise(planes: Planes, mask: np.ndarray, collected: Collected, noise: NoiseModel) -> tuple[NoiseModel, float]:
     """Return the noise of the frames and how many times the declared one it is: that itself and 1 where the frames are no noisier, or do
     not tell."""
-    sums = _even_sums(collected, len(sample.values))
-    grey = sample.grey
-    lit = sample.lit(grey, noise).reshape(sample.mask.shape)
-    compared = lit[:, :-2] & lit[:, 1:-1] & lit[:, 2:]
-    if len(sums) < 2 or compared.sum() < ENOUGH:
-        return noise, 1.0
+    first = np.unique(np.linspace(0, len(mask) - 1, TRIPLES + 2).astype(int)[1:-1] // 3 * 3)
+    first = first[first + 2 < len(mask)]
+    rows = (first[:, None] + np.arange(3)).ravel()
+    grey, clipped = line_readings(planes, rows, 1)
     variance = noise.read**2 + noise.gain * np.maximum(grey, 0)
-    factors = []
-    for one, other in pairwise(sums):
-        apart = (one - other) @ grey
-        expected = (one - other) ** 2 @ variance
-        bend, spread = (np.reshape(each, lit.shape) for each in (apart, expected))
-        bend = bend[:, :-2] - 2 * bend[:, 1:-1] + bend[:, 2:]
-        spread = spread[:, :-2] + 4 * spread[:, 1:-1] + spread[:, 2:]
-        factors.append(MAD_TO_SIGMA * np.median(np.abs(bend[compared]) / np.sqrt(spread[compared])))
-    factor = float(np.median(factors))
+    lit = mask[rows] & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(variance.max(axis=0)))
+    lit &= grey.max(axis=0) < FULL_PART * grey.max(initial=0.0)
+    if clipped is not None:
+        lit &= ~clipped
+    across: list[float] = []
+    along: list[float] = []
+    for apart, expected, alike in _differences(collected, grey, variance):
+        shape = (len(first), 3, -1)
+        apart, expected, alike = (each.reshape(shape) for each in (apart, expected, np.where(lit, alike, 0)))
+        for factors, axis in ((across, 2), (along, 1)):
+            factor = _factor(*(np.moveaxis(each, axis, -1) for each in (apart, expected, alike)))
+            factors += [] if factor is None else [factor]
+    told = [float(np.median(factors)) for factors in (across, along) if factors]
+    factor = min(told, default=1.0)
     return (noise, 1.0) if factor < NOISIER else (NoiseModel(noise.read * factor, noise.gain * factor**2), factor)
 
 
-def _even_sums(collected: Collected, frames: int) -> list[np.ndarray]:
-    """Return the weights [frames] float32 of the frames in each mean that is half the light of white and black."""
-    rows = []
-    if collected.white is not None and collected.black is not None:
-        rows.append(row_of(frames, (collected.white, collected.black), HALVES))
-    rows += [row for code in collected.codes for row in even_means(code, frames, UNBENT_STEPS)]
-    return [row.astype(np.float32) for row in rows]
+def _differences(collected: Collected, grey: np.ndarray, variance: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield differences of readings [frames, …] that are the same light, their expected variance, and the kind of light, 0 where none:
+    pixels of one kind are compared."""
+    frames = len(grey)
+    references = None if collected.white is None or collected.black is None else (collected.white, collected.black)
+    means = [] if references is None else [row_of(frames, references, HALVES)]
+    means += [row for code in collected.codes for row in even_means(code, frames)]
+    pairs = list(pairwise(means))
+    for code in collected.codes:
+        if isinstance(code, ModulatedCode) and len(code.frames) % 2 == 0:  # a wave and that of half a turn, over the shifts of the carrier
+            half = len(code.frames) // 2
+            opposite = [(*code.frames[step], *code.frames[step + half]) for step in range(half)]
+            pairs += pairwise(row_of(frames, each, np.full(len(each), 1 / len(each))) for each in opposite)
+    for one, other in pairs:
+        weights = (one - other).astype(np.float32)
+        yield np.tensordot(weights, grey, 1), np.tensordot(weights**2, variance, 1), np.ones(grey.shape[1:], int)
+    if references is None or not any(isinstance(code, PhaseCode) for code in collected.codes):
+        return
+    white, black = (grey[number] for number in references)
+    for code in collected.codes:
+        if isinstance(code, BinaryCode) and code.inverses is None:
+            for number in code.frames[-ceil(COARSE * len(code.frames)):]:
+                part = (grey[number] - black) / np.maximum(white - black, 1e-9)
+                lit, dark = np.abs(part - 1) < CLEAR, np.abs(part) < CLEAR
+                yield (grey[number] - np.where(lit, white, black), variance[number] + np.where(lit, *(variance[n] for n in references)),
+                       np.where(lit, 1, np.where(dark, 2, 0)))
+
+
+def _factor(apart: np.ndarray, expected: np.ndarray, alike: np.ndarray) -> float | None:
+    """Return by how much second differences along the last axis spread more than expected; None of too few."""
+    def three(values: np.ndarray, sides: float, middle: float) -> np.ndarray:
+        return np.asarray(sides * (values[..., :-2] + values[..., 2:]) + middle * values[..., 1:-1])
+
+    compared = (alike[..., 1:-1] > 0) & (alike[..., :-2] == alike[..., 1:-1]) & (alike[..., 2:] == alike[..., 1:-1])
+    if compared.sum() < ENOUGH:
+        return None
+    bend, spread = three(apart, 1, -2), three(expected, 1, 4)
+    return float(MAD_TO_SIGMA * np.median(np.abs(bend[compared]) / np.sqrt(spread[compared])))

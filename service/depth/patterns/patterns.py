@@ -103,10 +103,11 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise))
         codes = read_codes(capture, frames, shown, refine=request.refine)
         sample = sample_of(planes, capture.camera, mask)
-        warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, device, request)
+        measured = with_measured_noise(planes, mask, codes.collected, noise)
+        warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, measured[0], device, request)
         noisier = 1.0
         if declared:  # else what contradicts the declaration would count as noise
-            noise, noisier = with_measured_noise(sample, codes.collected, noise)
+            noise, noisier = measured
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
             timings.stage("decode", mask.shape[0])
@@ -182,13 +183,13 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
 
 
 def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projector: Projector | None, capture: Capture,
-             frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> Checks:
-    """Judge the declaration by a sample of the frames."""
+             frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
+    """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)
-    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, noise)
+    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, measured)
     waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
     wrong = wrong or waves.wrong
     if wrong is not None:

@@ -112,11 +112,13 @@ def grey_of(values: np.ndarray) -> np.ndarray:
 
 
 def line_readings(planes: Planes, lines: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the readings [frames, lines, length] of some image rows or columns, and where a frame is clipped [lines, length]."""
-    if across == 1:
-        values = np.moveaxis(planes.values[:, lines], 2, 1)
-        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, lines].any(axis=0))
-    else:
-        values = np.moveaxis(planes.values[:, :, :, lines], (2, 3), (1, 2))
-        clipped = None if planes.saturated is None else np.asarray(planes.saturated[:, :, lines].any(axis=0)).T
-    return grey_of(values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:]), clipped
+    """Return the readings [frames, lines, length] of some image rows or columns, each pixel times its exposure as in bands, and where a
+    frame is clipped [lines, length]."""
+    def chosen(maps: np.ndarray | None) -> np.ndarray | None:
+        """Return the lines of maps [..., rows, cols], the longer side last."""
+        return None if maps is None else maps[..., lines, :] if across == 1 else np.swapaxes(maps[..., lines], -1, -2)
+
+    values = np.moveaxis(planes.values[:, lines], 2, 1) if across == 1 else np.moveaxis(planes.values[..., lines], (2, 3), (1, 2))
+    exposure, clipped = chosen(planes.exposure), chosen(planes.saturated)
+    grey = grey_of(values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:])
+    return grey if exposure is None else grey * exposure, None if clipped is None else np.asarray(clipped.any(axis=0))
