@@ -28,6 +28,7 @@ from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import moved_pixels
 from service.depth.patterns.pattern_checks import Sample, check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.projector_doubts import contradicted, widen
+from service.depth.patterns.ramp_checks import check_ramps
 from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
 from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.unseen_edges import measured_edge_error
@@ -184,12 +185,13 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
 
 def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projector: Projector | None, capture: Capture,
              frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
-    """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels are judged."""
+    """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels and ramps are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)
     wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, measured)
+    wrong = wrong or check_ramps(sample, codes.collected, shown, measured)
     waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
     wrong = wrong or waves.wrong
     if wrong is not None:
