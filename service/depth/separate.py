@@ -158,11 +158,9 @@ def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[flo
     longer than LONGEST_PX. Raises RequestError: no such period."""
     found: dict[float, list[Sinusoid]] = {}
     for code in (code for code in collected.codes if isinstance(code, PhaseCode)):
-        for period in dict.fromkeys(code.periods_px):
-            at = [index for index, other in enumerate(code.periods_px) if other == period]
-            shifts = tuple(code.shifts[index] for index in at)
+        for period, frames, shifts in code.waves:
             if len(set(shifts)) >= FULL_STEPS:
-                found.setdefault(period, []).append(Sinusoid(code.axis, tuple(code.frames[index] for index in at), shifts))
+                found.setdefault(period, []).append(Sinusoid(code.axis, frames, shifts))
     if not found:
         raise ManifestError("no period of a phase pattern has three shifts or more: relit separate needs such frames "
                             "(relit patterns phase, or gray-phase)")

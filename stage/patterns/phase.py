@@ -62,6 +62,15 @@ class PhasePattern(Strict):
         return f"{self.axis} phase of {self.period_px:g} px, step {self.step} of {self.steps}{offset}"
 
 
+class Wave(NamedTuple):
+    """The frames of one period, as indices into the list of frames."""
+
+    period_px: float
+    frames: tuple[int, ...]
+    shifts: tuple[float, ...]
+    """The shift of each frame in turns."""
+
+
 class PhaseCode(NamedTuple):
     """The phase frames of one axis, of all periods, as indices into the list of frames."""
 
@@ -78,9 +87,17 @@ class PhaseCode(NamedTuple):
         return "phase"
 
     @property
+    def waves(self) -> tuple[Wave, ...]:
+        """Return the frames of each period, in the order of their first frames."""
+        frames: dict[float, list[tuple[int, float]]] = {}
+        for period, frame, shift in zip(self.periods_px, self.frames, self.shifts, strict=True):
+            frames.setdefault(period, []).append((frame, shift))
+        return tuple(Wave(period, *zip(*members, strict=True)) for period, members in frames.items())
+
+    @property
     def micro(self) -> bool:
         """Return whether one period has all its steps and others have fewer than a phase of their own needs (Gupta and Nayar 2012)."""
-        counts = [self.periods_px.count(period) for period in dict.fromkeys(self.periods_px)]
+        counts = [len(wave.frames) for wave in self.waves]
         return min(counts) < FULL_STEPS <= max(counts)
 
     @classmethod

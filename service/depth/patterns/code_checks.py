@@ -277,12 +277,11 @@ def _check_waves(sample: Sample, stripes: Stripes, code: BinaryCode, collected: 
         return None
     stripe_px = code.stripe_px * 2**stripes.finest
     place, known = _smooth_place(stripes, gray=code.name != "binary", stripe_px=stripe_px)
-    for period in dict.fromkeys(phase.periods_px):
-        members = [index for index, other in enumerate(phase.periods_px) if other == period]
-        if len(members) < FULL_STEPS or stripe_px > period:
+    for period, frames, shifts in phase.waves:
+        if len(frames) < FULL_STEPS or stripe_px > period:
             continue
-        readings = sample.grey[[phase.frames[index] for index in members]]
-        _, along, across = weights(np.array([phase.shifts[index] for index in members]), period).T @ readings
+        readings = sample.grey[list(frames)]
+        _, along, across = weights(np.array(shifts), period).T @ readings
         swing = np.hypot(along, across)
         good = known.ravel() & (swing > CLEAR_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(readings.mean(axis=0), 0)))
         if good.sum() < ENOUGH:

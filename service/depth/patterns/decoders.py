@@ -223,8 +223,7 @@ def ramp_decoder(axis: AxisCodes) -> AxisDecoder | None:
 
 
 def _wrapped_phase(phase: PhaseCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> WrappedPhase:
-    errors = [axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
-              for period in dict.fromkeys(phase.periods_px)]
+    errors = [axis.projector.wave_error(wave.shifts, wave.period_px) for wave in phase.waves]
     return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
                         response=axis.projector.wave_response, wave_errors=errors, noise=noise)
 

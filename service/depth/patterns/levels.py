@@ -69,13 +69,10 @@ class EvenLevels(NamedTuple):
             if isinstance(code, BinaryCode) and code.inverses is not None and phases:
                 pairs += zip(code.frames, code.inverses, strict=True)
         for phase in phases:
-            for period in dict.fromkeys(phase.periods_px):
-                members = [index for index, other in enumerate(phase.periods_px) if other == period]
-                if len(members) >= FULL_STEPS:
-                    shifts = np.array([phase.shifts[index] for index in members])
-                    table = weights(shifts, period)
-                    waves.append(row_of(frames, [phase.frames[index] for index in members], table[:, 0]))
-                    means.extend(fitted_curve(light, table, shifts)[1] if response is not None else ())
+            waves += even_means(phase, frames)
+            for wave in phase.waves if response is not None else ():
+                if len(wave.frames) >= FULL_STEPS:
+                    means.extend(fitted_curve(light, weights(np.array(wave.shifts), wave.period_px), np.array(wave.shifts))[1])
         several = len(pairs) > 1
         return cls(np.stack([row_of(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
                    np.stack(waves) if len(waves) > 1 else None,
@@ -137,22 +134,15 @@ def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray
     return row
 
 
-def even_means(code: Code, frames: int, least_steps: int = FULL_STEPS) -> list[np.ndarray]:
+def even_means(code: Code, frames: int) -> list[np.ndarray]:
     """Return the weights [frames] of the frames in each mean of a code that is half the light of white and black: of bits and their
-    inverses, of ramps both ways, and of waves over their shifts, of which there are `least_steps`."""
+    inverses, of ramps both ways, and of waves over their shifts."""
     if isinstance(code, BinaryCode) and code.inverses is not None:
         return [row_of(frames, pair, HALVES) for pair in zip(code.frames, code.inverses, strict=True)]
     if isinstance(code, RampCode) and code.up is not None and code.down is not None:
         return [row_of(frames, (code.up, code.down), HALVES)]
-    found: list[np.ndarray] = []
-    if not isinstance(code, PhaseCode):
-        return found
-    for period in dict.fromkeys(code.periods_px):
-        members = [index for index, other in enumerate(code.periods_px) if other == period]
-        if len(members) >= least_steps:
-            shifts = np.array([code.shifts[index] for index in members])
-            found.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
-    return found
+    return [row_of(frames, wave.frames, weights(np.array(wave.shifts), wave.period_px)[:, 0])
+            for wave in (code.waves if isinstance(code, PhaseCode) else ()) if len(wave.frames) >= FULL_STEPS]
 
 
 def check_levels(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:

@@ -22,7 +22,7 @@ from stage.errors import StageError
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, Pattern, collect
-from stage.patterns.phase import PhaseCode
+from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.stack.planes import Planes
 
 ROWS = 32
@@ -265,12 +265,11 @@ def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noi
     good = sample.whole & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
     if good.sum() < ENOUGH:
         return None
-    shifts, periods = np.array(code.shifts), np.array(code.periods_px)
-    even = [np.flatnonzero(periods == period) for period in dict.fromkeys(code.periods_px)]
-    even = [members for members in even if len(members) >= 3 and abs(np.exp(2j * np.pi * shifts[members]).sum()) < 1e-6]
+    even = [list(wave.frames) for wave in code.waves
+            if len(wave.frames) >= FULL_STEPS and abs(np.exp(2j * np.pi * np.array(wave.shifts)).sum()) < 1e-6]
     if not even:
         return None
-    means = [np.median((np.mean(grey[[code.frames[i] for i in members]], axis=0)[good] - dark[good]) / span[good]) for members in even]
+    means = [np.median((np.mean(grey[frames], axis=0)[good] - dark[good]) / span[good]) for frames in even]
     mean = float(np.median(means))
     if abs(mean - 0.5) <= MEAN_TOLERANCE:
         return 1.0

@@ -44,16 +44,8 @@ def even_light(collected: Collected, response: Sequence[float] | None = None) ->
 
     None if no period has three shifts. The response is the projector's light at even levels from 0 to 1; without one it is linear.
     """
-    found: list[tuple[float, EvenLight]] = []
-    for code in collected.codes:
-        if not isinstance(code, PhaseCode):
-            continue
-        for period in dict.fromkeys(code.periods_px):
-            members = [index for index, other in enumerate(code.periods_px) if other == period]
-            if len(members) >= FULL_STEPS:
-                shifts = np.array([code.shifts[index] for index in members])
-                frames = tuple(code.frames[index] for index in members)
-                found.append((period, EvenLight(frames, weights(shifts, period))))
+    found = [(wave.period_px, EvenLight(wave.frames, weights(np.array(wave.shifts), wave.period_px)))
+             for code in collected.codes if isinstance(code, PhaseCode) for wave in code.waves if len(wave.frames) >= FULL_STEPS]
     if not found:
         return None
     light = max(found, key=lambda pair: pair[0])[1]

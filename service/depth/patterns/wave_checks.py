@@ -117,15 +117,14 @@ def unnumbered(collected: Collected, *, least_periods: int = 1) -> list[PhaseCod
 def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise: NoiseModel) -> Waves | None:
     """Return the phases of each period; None if fewer than ENOUGH pixels have all of them."""
     grey = sample.grey
-    periods = tuple(dict.fromkeys(code.periods_px))
+    waves = code.waves
     turns, deviation, clear = [], np.zeros(grey.shape[1]), sample.whole.copy()
-    for period in periods:
-        members = [index for index, other in enumerate(code.periods_px) if other == period]
-        if len(members) < FULL_STEPS:
+    for period, frames, turns_of in waves:
+        if len(frames) < FULL_STEPS:
             return None
-        shifts = np.array([code.shifts[index] for index in members])
+        shifts = np.array(turns_of)
         table = weights(shifts, period)
-        readings = grey[[code.frames[index] for index in members]].astype(np.float64)
+        readings = grey[list(frames)].astype(np.float64)
         mean, along, across = table.T @ readings
         swing = np.hypot(along, across)
         spread = np.sqrt(noise.read**2 + noise.gain * np.maximum(mean, 0))
@@ -135,12 +134,13 @@ def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise
             bend = phase_table(bent_wave(projector.wave_response), table, shifts, period)[:, 0]
             phase = phase + np.interp(phase, np.linspace(0, 2 * np.pi, BINS + 1), bend)
         turns.append(phase / (2 * np.pi) % 1.0)
-        deviation = np.maximum(deviation, np.sqrt(2 / len(members)) * spread / np.maximum(swing, 1e-12) / (2 * np.pi))
+        deviation = np.maximum(deviation, np.sqrt(2 / len(frames)) * spread / np.maximum(swing, 1e-12) / (2 * np.pi))
     if clear.sum() < ENOUGH:
         return None
     shape = sample.mask.shape
-    steps = min(code.periods_px.count(period) for period in periods)
-    return Waves(np.stack(turns).reshape(-1, *shape), deviation.reshape(shape), clear.reshape(shape), np.array(periods),
+    steps = min(len(wave.frames) for wave in waves)
+    return Waves(np.stack(turns).reshape(-1, *shape), deviation.reshape(shape), clear.reshape(shape),
+                 np.array([wave.period_px for wave in waves]),
                  projector.resolution[0 if code.axis == "column" else 1], steps)
 
 
