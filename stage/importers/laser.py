@@ -29,6 +29,7 @@ from stage.importers.layout import (
     assumed_encoding,
     color_space_of,
     first_of,
+    image_named,
     image_names,
     image_resolution,
     read_json,
@@ -221,13 +222,12 @@ def _matched(path: Path, table: PlaneTable, names: list[str]) -> tuple[list[int]
     """Return which image each plane belongs to, and how it was found."""
     count = len(table.values)
     if table.names is not None:
-        stems = {Path(name).stem.lower(): index for index, name in enumerate(names)}
-        order = [stems.get(Path(name).stem.lower(), -1) for name in table.names]
-        if -1 in order or len(set(order)) < len(order):
-            raise ManifestError(f"{path}: {table.names[order.index(-1)] if -1 in order else 'an image'} "
-                                + ("is not among the images" if -1 in order else "is named twice"))
+        found = [image_named(name, names) for name in table.names]
+        if None in found or len(set(found)) < len(found):
+            raise ManifestError(f"{path}: {table.names[found.index(None)] if None in found else 'an image'} "
+                                + ("is not among the images" if None in found else "is named twice"))
         left = f"; {len(names) - count} other images are left out" if count < len(names) else ""
-        return order, f"matched by the names in the file{left}"
+        return [names.index(name) for name in found if name is not None], f"matched by the names in the file{left}"
     if count == 1 < len(names):
         raise ManifestError(f"{path}: holds one plane, and there are {len(names)} images ({names[0]} to {names[-1]}): the scene of a "
                             "capture stands still, so that each image has a plane of its own: choose one image with --images")
