@@ -94,6 +94,10 @@ class KaryCode(NamedTuple):
         """Return how many stripes the code numbers: the projector shows as many or fewer."""
         return self.base**len(self.frames)
 
+    def without(self, digits: int) -> "KaryCode":
+        """Return the code of wider stripes that is left without so many of the finest digits."""
+        return self._replace(frames=self.frames[digits:], stripe_px=self.stripe_px * self.base**digits)
+
     @classmethod
     def collect(cls, frames: Mapping[KaryPattern, int]) -> "KaryCode":
         """Sort the frames of one code by digit."""

@@ -45,6 +45,8 @@ class PatternProjector(NamedTuple):
     """The error of a phase that is left when waves are bent back by the exponent; None: they are not bent back."""
     edge_error_px: float = EDGE_ERROR
     """The error in camera pixels of an edge of stripes, as of `measured_edge_error`."""
+    unseen_digits: tuple[int, int] = (0, 0)
+    """Number of the finest digits of k-ary codes along columns and rows that the camera does not resolve, as of `unseen_digits`."""
 
     @property
     def wave_response(self) -> Sequence[float] | None:

@@ -31,7 +31,7 @@ from service.depth.patterns.projector_doubts import contradicted, widen
 from service.depth.patterns.ramp_checks import check_ramps
 from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
 from service.depth.patterns.shifted_frames import widen_shifted
-from service.depth.patterns.unseen_edges import measured_edge_error
+from service.depth.patterns.unseen_stripes import measured_edge_error, unseen_digits, unseen_sentences
 from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
@@ -101,7 +101,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
-        shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise))
+        shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise),
+                               unseen_digits=unseen_digits(planes, mask, codes.collected, shown, noise))
         codes = read_codes(capture, frames, shown, refine=request.refine)
         sample = sample_of(planes, capture.camera, mask)
         measured = with_measured_noise(planes, mask, codes.collected, noise)
@@ -123,7 +124,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         moved, said = moved_pixels(planes, mask, sample, codes.collected, noise, shifted=coordinates.shift_px > 0)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
-    warnings += said
+    warnings += said + unseen_sentences(codes.collected, shown.unseen_digits)
     if noisier >= SAID_NOISIER:
         warnings.append(f"frames[]: readings are {noisier:.2g} times as noisy as --read-noise and --photon-gain say, and decoded as such: "
                         "expose longer, or say how noisy the camera is")
@@ -214,6 +215,9 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
         if len(frames) == sum(frame.pattern is not None for frame in capture.manifest.frames):
             collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
+        collected = collected._replace(codes=tuple(
+            code.without(projector.unseen_digits[0 if code.axis == "column" else 1]) if isinstance(code, KaryCode) else code
+            for code in collected.codes))
         columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
         rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
         return PatternCodes(collected, columns, rows, unused_columns + unused_rows)

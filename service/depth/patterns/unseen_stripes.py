@@ -1,0 +1,89 @@
+"""What the camera does not see of stripes: edges that pass between two pixels, and digits whose stripes are finer than its pixels or blur.
+
+Pixels of a camera see about as much of a surface as they are apart, and an edge changes the light of one of them at least. Images that are
+rendered or shrunk without a filter show points of the surface: an edge lies anywhere between two of them.
+
+The mean of all levels of a k-ary code is a level itself or lies near one: a blurred digit is read as the middle one and sure of it. Of
+stripes that are seen about two of k have the darkest and the brightest level.
+"""
+
+import numpy as np
+
+from kernels.structured.edges import WHOLE, edge_error_of
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.response import light_of
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.readings import line_readings
+from stage.patterns.base import Axis
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.kary import KaryCode
+from stage.stack.planes import Planes
+
+PAIRS = 32
+"""Number of pairs of neighbouring image rows whose edges are looked at, evenly spread."""
+LIT_SIGMAS = 20.0
+"""Least difference of a bit and its inverse, in deviations of a reading, of pixels whose edges count."""
+SEEN_PART, OF_A_STEP = 0.25, 0.25
+"""Part of two of k pixels that have the darkest or the brightest level of a digit that is seen, and the distance from these levels within
+which they have it, as a part of that to the next level."""
+FEW_EDGES = 16
+"""Number of edges that count as seen by pixels as wide as they are apart, so that few edges tell nothing."""
+
+
+def measured_edge_error(planes: Planes, mask: np.ndarray, collected: Collected, noise: NoiseModel) -> float:
+    """Return the RMS error in camera pixels of an edge of a Gray code with inverses that is found by linear interpolation."""
+    seen, whole = FEW_EDGES, FEW_EDGES * (1 - WHOLE)
+    grey, inside = _pairs_of_rows(planes, mask)
+    for code in collected.codes:
+        if not isinstance(code, BinaryCode) or code.name != "gray" or code.inverses is None:
+            continue
+        bits, inverses = grey[list(code.frames)], grey[list(code.inverses)]
+        apart, clearest = bits - inverses, np.abs(bits - inverses).max(axis=0)
+        deviation = np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(bits + inverses, 0).max(axis=0))
+        known = inside & (clearest > LIT_SIGMAS * deviation)
+        for side, other in ((np.s_[..., :-1], np.s_[..., 1:]), (np.s_[..., ::2, :], np.s_[..., 1::2, :])):  # along rows, and across pairs
+            changes = (apart[side] > 0) != (apart[other] > 0)
+            edge = (changes.sum(axis=0) == 1) & known[side] & known[other]
+            full = np.abs(apart) >= WHOLE * clearest
+            seen += int(edge.sum())
+            whole += int((changes & full[side] & full[other]).any(axis=0)[edge].sum())
+    return edge_error_of(whole / seen)
+
+
+def unseen_digits(planes: Planes, mask: np.ndarray, collected: Collected, projector: PatternProjector,
+                  noise: NoiseModel) -> tuple[int, int]:
+    """Return how many of the finest digits of k-ary codes in grey levels, along columns and along rows, the camera does not resolve."""
+    found: dict[Axis, int] = {"column": 0, "row": 0}
+    codes = [code for code in collected.codes if isinstance(code, KaryCode) and code.levels is not None]
+    if not codes or collected.white is None or collected.black is None:
+        return 0, 0
+    grey, inside = _pairs_of_rows(planes, mask)
+    white, black = grey[collected.white], grey[collected.black]
+    lit = inside & (white - black > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(white, 0)))
+    for code in codes:
+        levels = np.sort(light_of(projector.response, np.array(code.levels)))
+        dark, bright = levels[0] + OF_A_STEP * (levels[1] - levels[0]), levels[-1] - OF_A_STEP * (levels[-1] - levels[-2])
+        for number in code.frames[:-1] if lit.any() else ():
+            part = (grey[number] - black)[lit] / (white - black)[lit]
+            if ((part < dark) | (part > bright)).mean() > SEEN_PART * 2 / code.base:
+                break
+            found[code.axis] += 1
+    return found["column"], found["row"]
+
+
+def unseen_sentences(codes: Collected, unseen: tuple[int, int]) -> list[str]:
+    """Return what is said of digits that the camera does not resolve, of the codes that are left without them."""
+    return [f"frames[].pattern: the camera does not resolve the finest {f'{number} digits' if number > 1 else 'digit'} of the {code.axis} "
+            f"kary code: {'they are' if number > 1 else 'it is'} left out, and stripes are {code.stripe_px:g} px wide; focus projector and "
+            "camera, or project wider stripes"
+            for code in codes.codes if isinstance(code, KaryCode) and (number := unseen[0 if code.axis == "column" else 1])]
+
+
+def _pairs_of_rows(planes: Planes, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the readings [frames, 2 pairs, cols] of pairs of neighbouring rows, and which pixels count."""
+    first = np.unique(np.linspace(0, len(mask) - 1, PAIRS + 2).astype(int)[1:-1] // 2 * 2)
+    first = first[first + 1 < len(mask)]
+    rows = np.stack([first, first + 1], axis=1).ravel()
+    grey, clipped = line_readings(planes, rows, 1)
+    return grey, mask[rows] if clipped is None else mask[rows] & ~clipped
