@@ -69,8 +69,8 @@ BELOW: dict[str, dict[str, Any]] = {"30 % of the light": {"scattered": 0.3}, "90
 """Parts of the light that run below the surface, 6 px far where nothing else is said."""
 NOISES = {"": (0.003, 10000.0), ", weak light": (0.006, 2500.0)}
 """Read noise as a part of full scale, and electrons at full scale."""
-
-NOISY = 0.02
+NOISY, UNSHARP_PX = 0.02, 3.0
+"""Noise of cameras that are noisier than declared, and deviation of a projector's focus in its pixels."""
 
 
 def trials(data: Path | None) -> Iterator[Trial]:
@@ -91,6 +91,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield _run(f"{name}, gamma {GAMMA} declared", True, bent, patterns, light, response=response)
         if not name.startswith("k-ary"):
             yield _run(f"{name}, gamma {GAMMA} not declared", False, bent, patterns, light)
+    yield _run(f"ramps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), CODES["ramps"], light)
+    yield _run(f"k-ary, reflected, out of focus by {UNSHARP_PX:g} px", False, World(shapes=SHELF, blur_px=UNSHARP_PX),
+               CODES["k-ary, reflected"], light)
     for fog in (0.5, 1.5, 3.0):
         yield _run(f"Gray in fog of {fog:g} / m", False, World(shapes=SHELF, fog=fog, light=0.5 + fog, samples=2), GRAY)
     yield _run("phase 16, 4 steps, Gray, in fog of 3 / m", False, World(shapes=SHELF, fog=3.0, light=3.5, samples=2), PHASE_GRAY)
