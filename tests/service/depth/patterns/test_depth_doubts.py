@@ -146,7 +146,7 @@ def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("patterns", [GRAY, kary_patterns(WIDTH, "column", base=3, reflected=False),
+@pytest.mark.parametrize("patterns", [GRAY, kary_patterns(WIDTH, "column", base=3, reflected=False, stripe_px=4),
                                       (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False)),
                                       (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())])
 def test_right_captures_raise_no_alarm(relit, tmp_path, light, patterns):
