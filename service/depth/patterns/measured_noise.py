@@ -39,7 +39,8 @@ def with_measured_noise(planes: Planes, mask: np.ndarray, collected: Collected, 
     not tell."""
     first = np.unique(np.linspace(0, len(mask) - 1, TRIPLES + 2).astype(int)[1:-1] // 3 * 3)
     first = first[first + 2 < len(mask)]
-    rows = (first[:, None] + np.arange(3)).ravel()
+    rows = (first[:, None] + np.arange(3)).ravel() if len(first) else np.arange(len(mask))
+    shape = (-1, min(3, len(mask)), mask.shape[1])
     grey, clipped = line_readings(planes, rows, 1)
     variance = noise.read**2 + noise.gain * np.maximum(grey, 0)
     lit = mask[rows] & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(variance.max(axis=0)))
@@ -49,7 +50,6 @@ def with_measured_noise(planes: Planes, mask: np.ndarray, collected: Collected, 
     across: list[float] = []
     along: list[float] = []
     for apart, expected, alike in _differences(collected, grey, variance):
-        shape = (len(first), 3, -1)
         apart, expected, alike = (each.reshape(shape) for each in (apart, expected, np.where(lit, alike, 0)))
         for factors, axis in ((across, 2), (along, 1)):
             factor = _factor(*(np.moveaxis(each, axis, -1) for each in (apart, expected, alike)))

@@ -7,6 +7,8 @@ import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
+from stage.patterns.phase import phase_patterns as waves
+from tests.scenes.captures import write_image
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
 
 NOISE = 0.02
@@ -40,6 +42,22 @@ def test_noise_beyond_what_is_declared_is_named_and_held_by_sigma(tmp_path, name
 @pytest.mark.parametrize("noise", [0.0, 0.004, NOISE])
 def test_right_noise_is_not_named(tmp_path, noise):
     assert measured(tmp_path, WAVES, noise, read_noise=max(noise, 0.003))[1:] == (None, [])
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_images_of_few_rows_tell_it_too(tmp_path, rows):
+    """The noise of the default at the mean level is .0066."""
+    random, place, frames = np.random.default_rng(3), np.broadcast_to(20 + 0.5 * np.arange(420), (rows, 420)), []
+    for number, pattern in enumerate(waves("column", (16, 18, 21), 4)):
+        image = 0.1 + 0.6 * pattern.level(place, None, 256) + NOISE * random.standard_normal(place.shape)
+        write_image(tmp_path / f"{number}.png", np.rint(np.clip(image, 0, 1) * 65535).astype(np.uint16))
+        frames.append({"image": f"{number}.png", "pattern": pattern.model_dump(mode="json", exclude_none=True)})
+    (tmp_path / "capture.json").write_text(json.dumps({
+        "schema": "relit.capture/1", "name": "line", "color_space": "lin_rec709_scene", "frames": frames,
+        "camera": {"projection": "orthographic", "resolution": [420, rows]}, "projector": {"resolution": [256, 64]}}))
+    depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
+    told = json.loads((tmp_path / "out" / "report.json").read_text())["found"]
+    assert told["noise_factor"] == pytest.approx(3.0, rel=0.15)
 
 
 def test_stripes_alone_are_decoded_as_declared(tmp_path):
