@@ -73,7 +73,7 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
     """Return a sentence if the stripes or the waves of a sample contradict what they are declared to be; None if they do not."""
     for code in collected.codes:
         if isinstance(code, BinaryCode):
-            extent = projector.resolution[0 if code.axis == "column" else 1]
+            extent = projector.extent(code.axis)
             stripes = read_stripes(sample, code, collected, noise)
             if stripes is not None:
                 found = _check_order(stripes, code, extent) or _check_waves(sample, stripes, code, collected, noise)
@@ -104,7 +104,7 @@ def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projecto
     if len(steps) < ENOUGH or not steps.any():
         return None
     jumps = steps > JUMP * max(float(np.median(steps[steps > 0])), 1.0)
-    count = projector.resolution[0 if code.axis == "column" else 1] / code.stripe_px
+    count = projector.extent(code.axis) / code.stripe_px
     others = [(f"reflected is {str(not code.reflected).lower()}: check it", digits, not code.reflected)]
     for first, second in combinations(range(len(digits)), 2):
         order = np.arange(len(digits))

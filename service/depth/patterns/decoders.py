@@ -48,6 +48,14 @@ class PatternProjector(NamedTuple):
     unseen_digits: tuple[int, int] = (0, 0)
     """Number of the finest digits of k-ary codes along columns and rows that the camera does not resolve, as of `unseen_digits`."""
 
+    def extent(self, axis: Axis) -> int:
+        """Return the projector's pixels along an axis."""
+        return self.resolution[0 if axis == "column" else 1]
+
+    def unseen(self, axis: Axis) -> int:
+        """Return the number of unseen digits along an axis."""
+        return self.unseen_digits[0 if axis == "column" else 1]
+
     @property
     def wave_response(self) -> Sequence[float] | None:
         """Return the response by which waves are bent back, declared or found; None: none."""
@@ -113,7 +121,7 @@ class AxisCodes:
     @property
     def extent(self) -> int:
         """Return the projector's pixels along the axis."""
-        return self.projector.resolution[0 if self.axis == "column" else 1]
+        return self.projector.extent(self.axis)
 
     @property
     def stripes(self) -> list[BinaryCode | KaryCode]:

@@ -15,8 +15,8 @@ import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.levels import COARSE, HALVES, even_means, row_of
-from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART
-from service.depth.patterns.readings import line_readings
+from service.depth.patterns.pattern_checks import ENOUGH, sample_of
+from stage.capture.camera import Camera
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.modulated import ModulatedCode
@@ -26,27 +26,23 @@ from stage.stack.planes import Planes
 
 TRIPLES = 32
 """Number of groups of three neighbouring image rows that are looked at, evenly spread."""
-LIT_SIGMAS = 20.0
-"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that tell noise."""
 CLEAR = 0.25
 """Distance from white or black, as a part of their difference, within which a bit is lit or dark."""
 NOISIER, SAID_NOISIER = 1.25, 2.0
 """Noise in the noise that is declared from which on it is taken instead, and from which on that is said."""
 
 
-def with_measured_noise(planes: Planes, mask: np.ndarray, collected: Collected, noise: NoiseModel) -> tuple[NoiseModel, float]:
+def with_measured_noise(planes: Planes, camera: Camera, mask: np.ndarray, collected: Collected,
+                        noise: NoiseModel) -> tuple[NoiseModel, float]:
     """Return the noise of the frames and how many times the declared one it is: that itself and 1 where the frames are no noisier, or do
     not tell."""
     first = np.unique(np.linspace(0, len(mask) - 1, TRIPLES + 2).astype(int)[1:-1] // 3 * 3)
     first = first[first + 2 < len(mask)]
     rows = (first[:, None] + np.arange(3)).ravel() if len(first) else np.arange(len(mask))
     shape = (-1, min(3, len(mask)), mask.shape[1])
-    grey, clipped = line_readings(planes, rows, 1)
-    variance = noise.read**2 + noise.gain * np.maximum(grey, 0)
-    lit = mask[rows] & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(variance.max(axis=0)))
-    lit &= grey.max(axis=0) < FULL_PART * grey.max(initial=0.0)
-    if clipped is not None:
-        lit &= ~clipped
+    sample = sample_of(planes, camera, mask, rows)
+    grey = sample.grey
+    variance, lit = noise.read**2 + noise.gain * np.maximum(grey, 0), sample.lit(grey, noise)
     across: list[float] = []
     along: list[float] = []
     for apart, expected, alike in _differences(collected, grey, variance):

@@ -86,9 +86,10 @@ class Sample(NamedTuple):
         return self.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * deviation)
 
 
-def sample_of(planes: Planes, camera: Camera, mask: np.ndarray) -> Sample:
-    """Return evenly spread rows of the frames."""
-    rows = np.unique(np.linspace(0, mask.shape[0] - 1, ROWS + 2).astype(int)[1:-1]) if mask.shape[0] > ROWS else np.arange(mask.shape[0])
+def sample_of(planes: Planes, camera: Camera, mask: np.ndarray, rows: np.ndarray | None = None) -> Sample:
+    """Return some rows of the frames; None: evenly spread ones."""
+    if rows is None:
+        rows = np.unique(np.linspace(0, len(mask) - 1, ROWS + 2).astype(int)[1:-1]) if len(mask) > ROWS else np.arange(len(mask))
     x, y = camera.plane_coordinates()
     values = np.concatenate([planes.band(slice(row, row + 1)) for row in rows], axis=2)
     saturated = None if planes.saturated is None else planes.saturated[:, rows].reshape(len(values), -1)

@@ -105,7 +105,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                                unseen_digits=unseen_digits(planes, mask, codes.collected, shown, noise))
         codes = read_codes(capture, frames, shown, refine=request.refine)
         sample = sample_of(planes, capture.camera, mask)
-        measured = with_measured_noise(planes, mask, codes.collected, noise)
+        measured = with_measured_noise(planes, capture.camera, mask, codes.collected, noise)
         warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, measured[0], device, request)
         noisier = 1.0
         if declared:  # else what contradicts the declaration would count as noise
@@ -124,7 +124,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         moved, said = moved_pixels(planes, mask, sample, codes.collected, noise, shifted=coordinates.shift_px > 0)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
-    warnings += said + unseen_sentences(codes.collected, shown.unseen_digits)
+    warnings += said + unseen_sentences(codes.collected, shown)
     if noisier >= SAID_NOISIER:
         warnings.append(f"frames[]: readings are {noisier:.2g} times as noisy as --read-noise and --photon-gain say, and decoded as such: "
                         "expose longer, or say how noisy the camera is")
@@ -216,8 +216,7 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
             collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
         collected = collected._replace(codes=tuple(
-            code.without(projector.unseen_digits[0 if code.axis == "column" else 1]) if isinstance(code, KaryCode) else code
-            for code in collected.codes))
+            code.without(projector.unseen(code.axis)) if isinstance(code, KaryCode) else code for code in collected.codes))
         columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
         rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
         return PatternCodes(collected, columns, rows, unused_columns + unused_rows)

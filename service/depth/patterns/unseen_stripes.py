@@ -9,7 +9,7 @@ stripes that are seen about two of k have the darkest and the brightest level.
 
 import numpy as np
 
-from kernels.structured.edges import WHOLE, edge_error_of
+from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.response import light_of
 from service.depth.patterns.decoders import PatternProjector
@@ -33,11 +33,13 @@ FEW_EDGES = 16
 
 def measured_edge_error(planes: Planes, mask: np.ndarray, collected: Collected, noise: NoiseModel) -> float:
     """Return the RMS error in camera pixels of an edge of a Gray code with inverses that is found by linear interpolation."""
+    codes = [code for code in collected.codes if isinstance(code, BinaryCode) and code.name == "gray" and code.inverses is not None]
+    if not codes:
+        return EDGE_ERROR
     seen, whole = FEW_EDGES, FEW_EDGES * (1 - WHOLE)
     grey, inside = _pairs_of_rows(planes, mask)
-    for code in collected.codes:
-        if not isinstance(code, BinaryCode) or code.name != "gray" or code.inverses is None:
-            continue
+    for code in codes:
+        assert code.inverses is not None
         bits, inverses = grey[list(code.frames)], grey[list(code.inverses)]
         apart, clearest = bits - inverses, np.abs(bits - inverses).max(axis=0)
         deviation = np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(bits + inverses, 0).max(axis=0))
@@ -72,12 +74,12 @@ def unseen_digits(planes: Planes, mask: np.ndarray, collected: Collected, projec
     return found["column"], found["row"]
 
 
-def unseen_sentences(codes: Collected, unseen: tuple[int, int]) -> list[str]:
+def unseen_sentences(codes: Collected, projector: PatternProjector) -> list[str]:
     """Return what is said of digits that the camera does not resolve, of the codes that are left without them."""
     return [f"frames[].pattern: the camera does not resolve the finest {f'{number} digits' if number > 1 else 'digit'} of the {code.axis} "
             f"kary code: {'they are' if number > 1 else 'it is'} left out, and stripes are {code.stripe_px:g} px wide; focus projector and "
             "camera, or project wider stripes"
-            for code in codes.codes if isinstance(code, KaryCode) and (number := unseen[0 if code.axis == "column" else 1])]
+            for code in codes.codes if isinstance(code, KaryCode) and (number := projector.unseen(code.axis))]
 
 
 def _pairs_of_rows(planes: Planes, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

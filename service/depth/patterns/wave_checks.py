@@ -141,7 +141,7 @@ def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise
     steps = min(len(wave.frames) for wave in waves)
     return Waves(np.stack(turns).reshape(-1, *shape), deviation.reshape(shape), clear.reshape(shape),
                  np.array([wave.period_px for wave in waves]),
-                 projector.resolution[0 if code.axis == "column" else 1], steps)
+                 projector.extent(code.axis), steps)
 
 
 def some_of(waves: Waves, count: int) -> tuple[np.ndarray, np.ndarray]:
