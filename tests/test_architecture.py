@@ -2,7 +2,6 @@
 
 import ast
 import re
-import subprocess
 import sys
 from contextlib import suppress
 from functools import cache
@@ -243,46 +242,6 @@ def test_no_cycles():
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
-def test_the_command_line_starts_without_heavy_libraries(arguments):
-    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib",
-             "fast_simplification", "gerbonara", "laspy", "rawpy", "small_gicp", "xatlas")
-    code = ("import sys, service.cli.main\n"
-            f"sys.argv[1:] = {arguments!r}\n"
-            "try: service.cli.main.main()\n"
-            f"finally: print([name for name in {heavy!r} if name in sys.modules])")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
-def test_images_are_read_without_opencv():
-    """It takes a tenth of a second to start, which only AVIF and camera raw need."""
-    code = "import sys, service.solve.solve; print('cv2' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
-    assert done.stdout.strip() == "False"
-
-
-def test_the_client_starts_without_heavy_libraries():
-    """A pipeline's interpreter loads no server, database, image library or device, even when it makes a client and a job."""
-    heavy = ("fastapi", "starlette", "dbos", "uvicorn", "sqlalchemy", "numpy", "warp", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2",
-             "pxr", "typer", "kernels", "service.server", "service.solve", "stage.formats.images", "stage.capture.capture")
-    code = ("import sys; from service.client import Client; from service.requests.jobs import SolveJob; Client().close(); "
-            f"print([name for name in {heavy!r} if name in sys.modules])")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize(("process", "heavy"), [
-    ("service.server.process.serve", ("numpy", "warp", "alembic", "service.solve")),
-    ("service.server.process.processes",
-     ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
-])
-def test_what_watches_workers_starts_without_what_they_need(process, heavy):
-    code = f"import sys, {process}; print([name for name in {heavy!r} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def loaded_names(path: Path) -> set[str]:
