@@ -131,7 +131,8 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         solution.height = None if solution.integration is None else to_numpy(solution.integration.height)
     placement = None
     if isinstance(opened.lights, DistantLights):
-        placement = place_solution(given, opened.lights, solution, partial(
+        shown = given.whole if opened.method is Method.SVBRDF else given  # what the materials of the solution reflect
+        placement = place_solution(shown, opened.lights, solution, partial(
             integrate, given, solution.normal, estimated, sigma=sigma, specular=specular))
     if solution.shared_misfit is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)

@@ -1,6 +1,6 @@
 """The input and the solution of every solver, and the judgement of a solution: pixels in doubt, lights that do not fit."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,6 +68,11 @@ class SolveInput:
     def device(self) -> str:
         """The first device."""
         return self.devices[0]
+
+    @property
+    def whole(self) -> "SolveInput":
+        """The same with all light that arrives: the sum of both images of polarised pairs."""
+        return self if self.pairs is None else replace(self, stack=self.pairs.whole, pairs=None)
 
     @cached_property
     def images(self) -> dict[str, ImagesOnDevice[Stack]]:

@@ -155,7 +155,7 @@ class _Walk:
             return
         samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._few:
-            self._supported = supports_lobes(self.result, samples, normal)
+            self._supported = supports_lobes(self.result, samples, normal, matt=self._matt)
         if self._supported:
             shapes = choose_diffuse(samples, normal)
             self._shape, self._lobe = shapes.mean, shapes.best

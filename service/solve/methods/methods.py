@@ -58,22 +58,22 @@ def _single_lights(*series: Rounds) -> dict[type, Solver]:
 def _solve_material(given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
     from service.solve.methods.material import solve_material
 
-    return _with_highlights(given, lights, field, solve_material(given, lights, field))
+    return _with_highlights(given, lights, field, solve_material)
 
 
 def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
     from service.solve.methods.material import refine_material
 
-    return _with_highlights(given, lights, field, refine_material(given, lights, field, before))
+    return _with_highlights(given, lights, field, partial(refine_material, before=before))
 
 
-def _with_highlights(given: SolveInput, lights: Lights, field: NearField | None, solution: Solution) -> Solution:
+def _with_highlights(given: SolveInput, lights: Lights, field: NearField | None, solver: NormalSolver) -> Solution:
     if given.pairs is None:
-        return solution
+        return solver(given, lights, field)
     from service.solve.methods.material import solve_material
     from service.solve.methods.polarised import solve_pairs
 
-    return solve_pairs(given, lights, field, solution, solve_material)
+    return solve_pairs(given, lights, field, solver, solve_material)
 
 
 def _solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:

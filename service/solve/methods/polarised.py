@@ -8,7 +8,7 @@ of both images, as without polarisers, and its diffuse albedo is that of the dif
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import SeparatedPairs, Solution, SolveInput
 from service.solve.methods.kinds import MATERIAL_PIXELS, material_report
+from service.solve.methods.near import NormalSolver
 from service.solve.methods.pairs import PairFindings, examine_pairs
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
@@ -72,18 +73,19 @@ def separate_pairs(stack: Stack, capture: Capture, lights: DistantLights | Place
     return Separated(diffuse, kept, SeparatedPairs(part(Component.SPECULAR), part(Component.WHOLE), facts, _leak_warnings(leak, found)))
 
 
-def solve_pairs(given: SolveInput, lights: Lights, field: NearField | None, diffuse: Solution, solver: Any) -> Solution:
-    """Complete in place what was solved from diffuse images: specular lobes from the specular ones, and metals from the sum, by `solver`,
-    which is `solve_material`."""
+def solve_pairs(given: SolveInput, lights: Lights, field: NearField | None, solver: NormalSolver, of_metals: NormalSolver) -> Solution:
+    """Solve diffuse images by `solver`, without the metals, of which they hold noise; specular lobes from the specular images; and metals
+    from the sum, by `of_metals`."""
     pairs = given.pairs
     assert pairs is not None
+    metal = without_diffuse(given)
+    diffuse = solver(replace(given, mask=given.mask & ~metal.reshape(given.mask.shape)), lights, field)
     diffuse.abundance = diffuse.pair = diffuse.pairs = None
     diffuse.facts.pop("mixed_pixels", None)
     diffuse.facts.pop("shared_materials", None)
-    metal = without_diffuse(given)
     diffuse.facts["polarisation"] = pairs.facts | {"pixels_without_diffuse_light": int(metal.sum())}
     if metal.any():
-        _solve_metals(given, lights, field, diffuse, metal, solver)
+        _solve_metals(given, lights, field, diffuse, metal, of_metals)
     _fit_lobes(given, lights, field, diffuse, np.isin(diffuse.status, ESTIMATED) & ~metal)
     return diffuse
 
@@ -110,11 +112,12 @@ def without_diffuse(given: SolveInput) -> np.ndarray:
     return seen & (diffuse < LEAST_DIFFUSE * specular)
 
 
-def _solve_metals(given: SolveInput, lights: Lights, field: NearField | None, diffuse: Solution, metal: np.ndarray, solver: Any) -> None:
-    """Replace the solution of pixels without diffuse light by that of the sums, with the albedo of the diffuse images."""
+def _solve_metals(given: SolveInput, lights: Lights, field: NearField | None, diffuse: Solution, metal: np.ndarray,
+                  solver: NormalSolver) -> None:
+    """Solve the pixels without diffuse light from the sums; their albedo is that of the diffuse images."""
     assert given.pairs is not None
-    whole = replace(given, stack=given.pairs.whole, mask=metal.reshape(given.mask.shape), pairs=None)
-    found = solver(whole, lights._replace(scale=given.pairs.whole.scale), field)
+    whole = replace(given.whole, mask=metal.reshape(given.mask.shape))
+    found = solver(whole, lights._replace(scale=whole.stack.scale), field)
     for name in ("normal", "specular", "roughness", "residual", "status", "sigma", "albedo_own", "albedo_tilt"):
         getattr(diffuse, name)[..., metal] = getattr(found, name)[..., metal]
     pixels = np.flatnonzero(metal & np.isin(diffuse.status, ESTIMATED))

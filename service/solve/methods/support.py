@@ -88,10 +88,11 @@ def is_supported(general: float, lambert: float) -> bool:
     return general <= (SUPPORTED_RATIO if min(general, lambert) < UNDESCRIBED else UNDESCRIBED_RATIO) * lambert
 
 
-def supports_lobes(result: Solution, samples: Samples, start: np.ndarray) -> bool:
-    """Return whether few lights support the general solver, and say in the solution what speaks against it; parameters as of leave_out."""
+def supports_lobes(result: Solution, samples: Samples, start: np.ndarray, *, matt: bool) -> bool:
+    """Return whether few lights support the general solver, and say in the solution what speaks against it; parameters as of leave_out.
+    `matt`: the images hold diffuse light alone, so that no specular lobe is expected."""
     count = samples.light_count
-    fallback = ("normals are drawn to those of lambert and no specular lobe is estimated; capture 32 lights or more, "
+    fallback = (f"normals are drawn to those of lambert{'' if matt else ' and no specular lobe is estimated'}; capture 32 lights or more, "
                 "spread over the hemisphere, or take --method robust")
     if count < TESTED_LIGHTS:
         result.warnings.append(f"method svbrdf: {count} lights are fewer than the unknowns of a pixel: {fallback}.")
