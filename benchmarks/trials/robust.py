@@ -73,6 +73,10 @@ class Case:
     """Standard deviation of the noise at full scale; it is shot noise, and a tenth of it in the dark."""
     exposure: float = 0.9
     """Brightest reading, of full scale; above 1 it is cut off."""
+    dark: float = 0.3
+    """Albedo of the darker squares; that of the others is 0.8."""
+    glare: float = 0.0
+    """Light that lies over an image, as a part of its mean."""
 
 
 CASES = [
@@ -82,28 +86,32 @@ CASES = [
     Case("glaze, 60 lights", glaze, 60, 65), Case("glaze, 9 lights within 35°", glaze, 9, 35), Case("glaze, 3 lights", glaze, 3, 40),
     Case("glaze, 24 lights, cut off", glaze, 24, 55, exposure=2.5), Case("half metal, 40 lights", mixture, 40, 65),
     Case("metal, 60 lights", metal, 60, 65),
+    Case("white and black, 24 lights", matt, 24, 60, dark=0.04),
+    Case("white and black, 24 lights, glare of 3 %", matt, 24, 60, dark=0.04, glare=0.03),
 ]
 
 
 def dunes() -> tuple[np.ndarray, np.ndarray]:
-    """Return normals [pixels, 3] and albedo [pixels] of the field."""
+    """Return normals [pixels, 3] of the field and where its squares are bright [pixels]."""
     across = (np.arange(SIZE) + 0.5) / SIZE
     x, y = (plane.ravel() for plane in np.meshgrid(across, -across))
     slope = np.zeros((2, x.size))
     for high, along_x, along_y, phase in WAVES:
         slope += high * np.cos(along_x * x + along_y * y + phase) * np.array([[along_x], [along_y]])
     normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=1)
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True), 0.3 + 0.5 * (np.sin(31 * x) * np.sin(27 * y) > 0)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True), np.sin(31 * x) * np.sin(27 * y) > 0
 
 
-def write(folder: Path, case: Case, normal: np.ndarray, albedo: np.ndarray) -> None:
+def write(folder: Path, case: Case, normal: np.ndarray, bright: np.ndarray) -> None:
     """Write the capture of a case."""
     random = np.random.default_rng(17)
     i = np.arange(case.lights) + 0.5
     up = 1 - (1 - np.cos(np.radians(case.widest))) * i / case.lights
     turn = np.pi * (1 + 5**0.5) * i + 0.4
     directions = np.stack([np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1)
+    albedo = np.where(bright, 0.8, case.dark)
     images = np.stack([albedo * case.shade(normal, direction) for direction in directions])
+    images += case.glare * images.mean(axis=1, keepdims=True)
     images *= case.exposure / np.percentile(images, 99.9)
     images += case.noise * np.sqrt(np.maximum(images, 0) + 0.01) * random.standard_normal(images.shape)
     frames = []
@@ -118,13 +126,13 @@ def write(folder: Path, case: Case, normal: np.ndarray, albedo: np.ndarray) -> N
 
 def trials(data: Path | None) -> Iterator[Trial]:
     """Yield every case by both methods, and the DiLiGenT objects under all of their lights and under ten."""
-    normal, albedo = dunes()
+    normal, bright = dunes()
     truth, mask = normal.reshape(SIZE, SIZE, 3), np.ones((SIZE, SIZE), dtype=bool)
     for case in CASES:
         with tempfile.TemporaryDirectory() as folder:
-            write(Path(folder), case, normal, albedo)
+            write(Path(folder), case, normal, bright)
             for method in (Method.LAMBERT, Method.ROBUST):
-                yield trial(case.name, Path(folder), truth, mask, in_model=case.shade is matt, method=method)[0]
+                yield trial(case.name, Path(folder), truth, mask, in_model=case.shade is matt and not case.glare, method=method)[0]
     for name in () if data is None else ("diligent_ball", "diligent_cat"):
         assert data is not None
         known = np.load(data / name / "normal_gt.npz")["normal"]

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from service.boards.stitching.form import fit_form
-from service.boards.stitching.grid import HeightMap, robust_sigma, tukey_weights
+from service.boards.stitching.grid import HeightMap, robust_sigma
 from stage.errors import BoardError
+from stage.spread import tukey_weights
 
 LEAST_CORRELATION = 0.5
 """The least correlation of the heights of a board with its openings."""

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label, median_filter, zoom
 from scipy.special import ndtr
 
-from service.boards.stitching.grid import BoardGrid, HeightMap, robust_sigma, tukey_weights
+from service.boards.stitching.grid import BoardGrid, HeightMap, robust_sigma
 from stage.formats.gerber import Pad
+from stage.spread import tukey_weights
 
 REACH = 0.5
 """Distance up to which paste belongs to a pad, as a part of the pad's smaller side."""

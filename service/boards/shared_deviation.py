@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.stitching.grid import TUKEY, HeightMap, gradients, local_means, robust_sigma, tukey_weights
-from stage.spread import between_blocks
+from service.boards.stitching.grid import HeightMap, gradients, local_means, robust_sigma
+from stage.spread import TUKEY, between_blocks, tukey_weights
 
 SIDE = 5
 """Side of the squares, pixels."""

@@ -14,10 +14,9 @@ from service.comparison.surfaces import Design, Offsets, ScannedSurface
 from service.scans.points.cloud import Cloud, Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, moved
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
-from service.scans.registration.fine import TUKEY
 from service.scans.registration.pairs import FEATURE_CELLS, MOST_POSES, ROUGH_POINTS
 from stage.errors import ScanError
-from stage.spread import MAD_TO_SIGMA
+from stage.spread import MAD_TO_SIGMA, tukey_weights
 
 CELLS_ACROSS = 60
 """The size of the design in cells of the rough scale."""
@@ -189,7 +188,7 @@ def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarra
         placed = found.at + found.across * found.distance[:, None]
         pivot = placed.mean(axis=0)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(found.distance)))
-        weight = np.maximum(1 - (found.distance / (TUKEY * max(spread, float(np.median(scan.sigma))))) ** 2, 0) ** 2
+        weight = tukey_weights(found.distance, max(spread, float(np.median(scan.sigma))))
         jacobian = gradient(placed, found.across, pivot)
         size = float(np.sqrt(np.mean((placed - pivot) ** 2) * 3))
         units = np.array([1 / size] * 3 + [1.0] * 3)

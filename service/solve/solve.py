@@ -27,6 +27,7 @@ from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
 from service.solve.steadiness import find_motion
 from service.solve.translucency import find_translucency
+from service.solve.veil import find_veil
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
@@ -113,6 +114,10 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         if translucency is not None:
             solution.warnings.append(translucency.sentence)
             raise_error(solution, translucency.degrees)
+        veil = find_veil(given, opened.lights, solution)
+        if veil is not None:
+            solution.warnings.append(veil.sentence)
+            raise_error(solution, veil.degrees)
     if "left_out_misfit" in solution.facts:
         from service.solve.methods.support import raise_undescribed
 

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates
 
-from service.boards.stitching.grid import BLOCK_PX, BoardGrid, blocks_of, robust_sigma, tukey_weights
+from service.boards.stitching.grid import BLOCK_PX, BoardGrid, blocks_of, robust_sigma
+from stage.spread import tukey_weights
 
 ROUNDS = 12
 DEGREE = 3

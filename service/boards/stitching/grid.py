@@ -12,8 +12,6 @@ from scipy.ndimage import correlate1d, uniform_filter
 from stage.capture.camera import Camera
 from stage.spread import MAD_TO_SIGMA
 
-TUKEY = 4.685
-"""Tukey's constant: residuals beyond so many σ count nothing."""
 BLOCK_PX = 16
 """The side of the blocks, in pixels, in which errors that neighbouring pixels share are told from noise."""
 
@@ -217,11 +215,6 @@ def robust_sigma(values: np.ndarray) -> float:
     if values.size == 0:
         return 0.0
     return float(MAD_TO_SIGMA * np.median(np.abs(values - np.median(values))))
-
-
-def tukey_weights(left: np.ndarray, scale: float) -> np.ndarray:
-    """Return the weights, 0…1, of residuals whose standard deviation is `scale`, by Tukey's biweight."""
-    return np.asarray(np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None)))
 
 
 def blocks_of(values: np.ndarray, side: int = BLOCK_PX) -> np.ndarray:

@@ -13,18 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from service.boards.stitching.grid import (
-    BLOCK_PX,
-    BoardGrid,
-    HeightPatch,
-    bends,
-    blocks_of,
-    edge_variance,
-    gradients,
-    robust_sigma,
-    tukey_weights,
-)
+from service.boards.stitching.grid import BLOCK_PX, BoardGrid, HeightPatch, bends, blocks_of, edge_variance, gradients, robust_sigma
 from service.boards.stitching.shift_search import LEAST_PIXELS, SHARED_PX, find_shifts
+from stage.spread import tukey_weights
 
 UNKNOWNS = 6
 LATERAL = slice(0, 3)

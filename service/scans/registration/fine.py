@@ -14,10 +14,8 @@ from service.scans.points.cloud import Cloud
 from service.scans.points.neighbours import NearestWithin
 from service.scans.points.rigid import applied, moved
 from service.scans.registration.coarse import ALIKE
-from stage.spread import MAD_TO_SIGMA
+from stage.spread import MAD_TO_SIGMA, tukey_weights
 
-TUKEY = 4.685
-"""Distances beyond this many standard deviations count nothing. Source: Tukey's biweight, 95 % efficient on normal noise."""
 STEPS = 12
 """The most steps at one reach."""
 STILL, NEARLY_STILL = 0.1, 0.2
@@ -206,7 +204,7 @@ def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, search: NearestWi
     seen_a = _dots(a.directions[at], normal) * a.sigma[at]
     sigma = np.sqrt(seen_a**2 + seen_b**2 + (0.05 * np.minimum(a.sigma[at], b.sigma[of])) ** 2)  # grazing rays: never 0
     ratio = MAD_TO_SIGMA * float(np.median(np.abs(across) / sigma))
-    weight = np.maximum(1 - (across / (TUKEY * max(ratio, 1.0) * sigma)) ** 2, 0) ** 2
+    weight = tukey_weights(across, max(ratio, 1.0) * sigma)
     # 16 neighbours that lie about a spacing away tilt a plane by a quarter of σ over the spacing
     tilt = max(ratio, 1.0) * np.hypot(a.sigma[at] / a.spacing[at], b.sigma[of] / b.spacing[of]) / 4
     bent_a, bent_b = a.normals[at] - a.near_normals[at], b.normals[of] - b.near_normals[of]

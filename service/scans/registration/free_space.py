@@ -9,8 +9,8 @@ from service.scans.points.cloud import Cloud
 from service.scans.points.neighbours import Neighbours
 from service.scans.points.rigid import applied, inverse
 from service.scans.points.scan import Scan
-from service.scans.registration.fine import TUKEY
 from stage.capture.camera import Camera
+from stage.spread import TUKEY
 
 MOST_PIXELS = 1 << 19
 """Most pixels that are kept of a range image. Of a larger one squares of pixels are taken together, each with its nearest and farthest."""

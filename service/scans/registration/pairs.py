@@ -11,8 +11,9 @@ from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
 from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
-from service.scans.registration.fine import TUKEY, Fit, Held, fit
+from service.scans.registration.fine import Fit, Held, fit
 from service.scans.registration.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
+from stage.spread import TUKEY
 
 FEATURE_CELLS = 5.0
 """Radius of the features in cells of the rough clouds, as Open3D's examples have it."""
