@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from scipy.ndimage import convolve1d, shift
 from stage.capture.manifest import Frame
 from stage.formats.images import write_png
 from stage.patterns.codes import Pattern, draw
+from stage.patterns.kary import KaryPattern
 from tests.reference.projector import look_at
 
 FULL_SCALE = 65535
@@ -80,6 +81,8 @@ class World:
     ambient: float = 0.03
     light: float = 0.8
     """Reading of white on a white surface that faces the projector at 1 m."""
+    tint: tuple[float, float, float] = (1.0, 0.6, 0.35)
+    """Parts of that in red, green and blue, under patterns of colours."""
     blur_px: float = 0.4
     """Standard deviation of the projector's focus, projector pixels."""
     samples: int = 4
@@ -233,7 +236,11 @@ def _add_fog(world: World, parts: list[tuple[np.ndarray, ...]], pixel: np.ndarra
 
 
 def images(world: World, light: Light | Sequence[Light], patterns: Sequence[Pattern]) -> np.ndarray:
-    """Return the recorded images, [frames, rows, cols] 0…1; `light`: that of all frames, or one for each."""
+    """Return the recorded images, [frames, rows, cols] 0…1, or [frames, rows, cols, 3] under patterns of colours; `light`: that of all
+    frames, or one for each."""
+    if any(isinstance(pattern, KaryPattern) and pattern.colors is not None for pattern in patterns):
+        return np.stack([images(replace(world, light=world.light * part, seed=world.seed + channel), light,
+                                [_channel(pattern, channel) for pattern in patterns]) for channel, part in enumerate(world.tint)], axis=-1)
     width, height = world.rig.camera
     rng = np.random.default_rng(world.seed)
     frames = np.empty((len(patterns), height, width))
@@ -254,6 +261,13 @@ def images(world: World, light: Light | Sequence[Light], patterns: Sequence[Patt
         frames[number] = np.clip(recorded, 0, 1).reshape(height, width)
     top = 2**world.bits - 1
     return np.rint(frames * top) / top
+
+
+def _channel(pattern: Pattern, channel: int) -> Pattern:
+    """Return what a projector shows of a pattern in one of its channels."""
+    if not isinstance(pattern, KaryPattern) or pattern.colors is None:
+        return pattern
+    return pattern.model_copy(update={"levels": tuple(color[channel] for color in pattern.colors), "colors": None})
 
 
 def _focus(shown: np.ndarray, blur_px: float) -> np.ndarray:
@@ -295,7 +309,7 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
     for number, (frame, pattern) in enumerate(zip(images(world, moments or light, patterns), declared or patterns, strict=True)):
         name = f"{number:03d}.png"
         if aside is not None:
-            frame = shift(frame, aside[number], order=1, mode="nearest")
+            frame = shift(frame, (*aside[number], *[0] * (frame.ndim - 2)), order=1, mode="nearest")
         write_png(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16), srgb=False)
         entries.append(Frame(image=name, pattern=pattern).model_dump(mode="json", exclude_defaults=True))
     (folder / "capture.json").write_text(json.dumps({

@@ -14,7 +14,7 @@ from service.requests.depth import DepthRequest
 from stage.errors import StageError
 from stage.patterns.binary import binary_patterns, xor_patterns
 from stage.patterns.codes import Pattern
-from stage.patterns.kary import kary_patterns
+from stage.patterns.kary import kary_patterns, palette
 from stage.patterns.modulated import modulated_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.patterns.ramp import ramp_patterns
@@ -48,6 +48,8 @@ CODES: dict[str, Sequence[Pattern]] = {
     "XOR": xor_patterns(WIDTH, "column"),
     "k-ary, reflected": kary_patterns(WIDTH, "column", base=3),
     "k-ary, plain": kary_patterns(WIDTH, "column", base=3, reflected=False),
+    "colours, base 4, reflected": kary_patterns(WIDTH, "column", base=4, colors=palette(4)),
+    "colours, base 3, plain": kary_patterns(WIDTH, "column", base=3, reflected=False, colors=palette(3)),
     "ramps": ramp_patterns("column"),
     "phase 16/18/21, 3 steps": phase_patterns("column", (16, 18, 21), 3),
     "phase 16/18/21, 4 steps": phase_patterns("column", (16, 18, 21), 4),
@@ -92,8 +94,11 @@ def trials(data: Path | None) -> Iterator[Trial]:
         if not name.startswith("k-ary"):
             yield _run(f"{name}, gamma {GAMMA} not declared", False, bent, patterns, light)
     yield _run(f"ramps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), CODES["ramps"], light)
-    yield _run(f"k-ary, reflected, out of focus by {UNSHARP_PX:g} px", False, World(shapes=SHELF, blur_px=UNSHARP_PX),
-               CODES["k-ary, reflected"], light)
+    for name in ("k-ary, reflected", "colours, base 4, reflected", "colours, base 3, plain"):
+        yield _run(f"{name}, out of focus by {UNSHARP_PX:g} px", False, World(shapes=SHELF, blur_px=UNSHARP_PX), CODES[name], light)
+    turned = kary_patterns(WIDTH, "column", base=4, colors=[color[::-1] for color in palette(4)])
+    name = "colours, base 4, reflected"
+    yield _run(f"{name}, red and blue exchanged", False, World(shapes=SHELF), turned, light, declared=CODES[name])
     for fog in (0.5, 1.5, 3.0):
         yield _run(f"Gray in fog of {fog:g} / m", False, World(shapes=SHELF, fog=fog, light=0.5 + fog, samples=2), GRAY)
     yield _run("phase 16, 4 steps, Gray, in fog of 3 / m", False, World(shapes=SHELF, fog=3.0, light=3.5, samples=2), PHASE_GRAY)

@@ -11,7 +11,6 @@ from scipy.ndimage import uniform_filter1d
 
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
-from kernels.structured.response import light_of
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
@@ -79,7 +78,7 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
                 found = _check_order(stripes, code, extent) or _check_waves(sample, stripes, code, collected, noise)
                 if found is not None:
                     return f"frames: {found}"
-        elif isinstance(code, KaryCode) and code.colors is None:
+        elif isinstance(code, KaryCode):
             found = _check_digits(sample, code, collected, projector, noise)
             if found is not None:
                 return f"frames: {found}"
@@ -87,40 +86,54 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
 
 
 def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
-    """Return how digits are declared wrongly; None if stripes follow each other as declared, or too few pixels read all digits."""
+    """Return how digits are declared wrongly; None if stripes follow each other as declared, or few pixels read the coarser digits."""
     if code.lacks(collected.white, collected.black) is not None:
         return None
-    grey, (height, width) = sample.grey, sample.mask.shape
-    white, black = grey[collected.white], grey[collected.black]
-    levels = light_of(projector.response, np.arange(code.base) / (code.base - 1) if code.levels is None else np.array(code.levels))
-    part = (grey[list(code.frames)] - black) / np.maximum(white - black, 1e-9)
-    away = np.abs(part - levels[:, None, None])
-    deviation = np.sqrt(2 * noise.read**2 + 2 * noise.gain * np.maximum(white, 0)) / np.maximum(white - black, 1e-9)
-    gap = np.diff(np.sort(levels)).min()
-    known = sample.lit(grey, noise) & (away.min(axis=0).max(axis=0) < CLEAR_BIT / 2 * gap) & (deviation * CLEAR_SIGMAS < gap / 2)
-    pairs = _Pairs.of(known.reshape(height, width))
-    digits = away.argmin(axis=0)
-    steps = pairs.steps(number_of(digits, code.base, reflected=code.reflected))
+    light, levels = sample.digit_light(code), projector.levels_of(code)
+    white, black = light[collected.white], light[collected.black]
+    contrast = np.maximum(white - black, 1e-9)
+    part = (light[list(code.frames)] - black) / contrast
+    deviation = (np.sqrt(2 * noise.read**2 + 2 * noise.gain * np.maximum(white, 0)) / contrast).max(axis=0)
+    gap = min(float(np.abs(one - other).max()) for one, other in combinations(levels, 2))
+
+    def read(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest digits [digits, pixels], and whether they are near."""
+        away = np.abs(part - levels[:, None, :, None]).max(axis=2)
+        return away.argmin(axis=0), away.min(axis=0) < CLEAR_BIT / 2 * gap
+
+    digits, clear = read(levels)
+    others = []
+    if code.colors is not None:
+        turned, also = read(levels[:, ::-1])
+        clear = clear | also
+        others.append(("red and blue are exchanged: check the order of the channels in the images", turned, code.reflected))
+    lit = sample.lit(sample.grey, noise) & (deviation * CLEAR_SIGMAS < gap / 2)
+    read_well = np.flatnonzero(clear[: 1 + len(digits) // 2, lit].sum(axis=1) >= READ_SHARE * max(int(lit.sum()), 1))
+    if not len(read_well):
+        return None
+    finest = int(read_well[0])
+    pairs = _Pairs.of((lit & clear[finest:].all(axis=0)).reshape(sample.mask.shape))
+    steps = pairs.steps(number_of(digits[finest:], code.base, reflected=code.reflected))
     if len(steps) < ENOUGH or not steps.any():
         return None
     jumps = steps > JUMP * max(float(np.median(steps[steps > 0])), 1.0)
-    count = projector.extent(code.axis) / code.stripe_px
-    others = [(f"reflected is {str(not code.reflected).lower()}: check it", digits, not code.reflected)]
-    for first, second in combinations(range(len(digits)), 2):
+    count = projector.extent(code.axis) / code.without(finest).stripe_px
+    others.append((f"reflected is {str(not code.reflected).lower()} in the frames' patterns: check it", digits, not code.reflected))
+    for first, second in combinations(range(finest, len(digits)), 2):
         order = np.arange(len(digits))
         order[[first, second]] = second, first
-        others.append((f"the digits {first} and {second} are exchanged: check digit", digits[order], code.reflected))
+        others.append((f"the digits {first} and {second} are exchanged: check digit in the frames' patterns", digits[order],
+                       code.reflected))
     mended = []
     for words, shown, reflected in others:
-        numbers = number_of(shown, code.base, reflected=reflected)
+        numbers = number_of(shown[finest:], code.base, reflected=reflected)
         better, after = _mends(numbers, pairs, steps, jumps, count, outside=False), pairs.steps(numbers)
         after = after[after > 0]
         if better is not None and (after > JUMP * np.median(after)).mean() < LEFT_JUMPS:  # more where the camera moves between frames
             mended.append((better, words))
     if not mended:
         return None
-    return (f"the {code.axis} stripes of the kary code do not follow each other as declared; they do if {min(mended)[1]} in the frames' "
-            "patterns")
+    return f"the {code.axis} stripes of the kary code do not follow each other as declared; they do if {min(mended)[1]}"
 
 
 def read_stripes(sample: Sample, code: BinaryCode, collected: Collected, noise: NoiseModel) -> Stripes | None:

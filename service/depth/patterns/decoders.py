@@ -14,7 +14,7 @@ from kernels.structured.binary import FINE_BITS, decode_binary, decode_gray, dec
 from kernels.structured.confirm import AROUND, confirm_stripes
 from kernels.structured.decoded import Decoded
 from kernels.structured.edges import EDGE_ERROR, REACH, refine_edges
-from kernels.structured.kary import decode_kary
+from kernels.structured.kary import decode_kary, expected_levels
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
 from kernels.structured.pattern_frames import NoiseModel
@@ -55,6 +55,11 @@ class PatternProjector(NamedTuple):
     def unseen(self, axis: Axis) -> int:
         """Return the number of unseen digits along an axis."""
         return self.unseen_digits[0 if axis == "column" else 1]
+
+    def levels_of(self, code: KaryCode) -> np.ndarray:
+        """Return the readings of the values of a digit as parts of white minus black, [k, channels], one channel for grey levels."""
+        crosstalk = None if self.crosstalk is None or code.colors is None else np.array(self.crosstalk)
+        return expected_levels(light_of(self.response, np.array(code.levels if code.levels is not None else code.colors)), crosstalk)
 
     @property
     def wave_response(self) -> Sequence[float] | None:
@@ -264,12 +269,10 @@ def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | Modulated
 def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> Decoded:
     if isinstance(code, KaryCode):
         assert axis.white is not None and axis.black is not None  # else it would not be among the codes
-        crosstalk = None if axis.projector.crosstalk is None or code.colors is None else np.array(axis.projector.crosstalk)
         frames = readings.colour if code.colors is not None and readings.colour is not None else readings.grey
         return decode_kary(frames, code.frames, white=axis.white, black=axis.black,
-                           levels=light_of(axis.projector.response, np.array(code.levels if code.levels is not None else code.colors)),
-                           reflected=code.reflected,
-                           extent=axis.extent, stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
+                           levels=axis.projector.levels_of(code), reflected=code.reflected, extent=axis.extent, stripe_px=code.stripe_px,
+                           noise=noise)
     white, black = axis.white, axis.black
     if axis.made_for(code) is not None:
         assert readings.made is not None  # as the decoder has asked

@@ -22,6 +22,7 @@ from stage.errors import StageError
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, Pattern, collect
+from stage.patterns.kary import KaryCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.stack.planes import Planes
 
@@ -71,6 +72,10 @@ class Sample(NamedTuple):
     def grey(self) -> np.ndarray:
         """Return [frames, pixels] float32."""
         return grey_of(self.values)
+
+    def digit_light(self, code: KaryCode) -> np.ndarray:
+        """Return [frames, channels, pixels] float32, of what the digits of a code differ in: colours, or one channel of grey."""
+        return self.grey[:, None] if code.colors is None else self.values
 
     @property
     def whole(self) -> np.ndarray:

@@ -101,10 +101,10 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
-        shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise),
-                               unseen_digits=unseen_digits(planes, mask, codes.collected, shown, noise))
-        codes = read_codes(capture, frames, shown, refine=request.refine)
         sample = sample_of(planes, capture.camera, mask)
+        shown = shown._replace(edge_error_px=measured_edge_error(planes, mask, codes.collected, noise),
+                               unseen_digits=unseen_digits(sample, codes.collected, shown, noise))
+        codes = read_codes(capture, frames, shown, refine=request.refine)
         measured = with_measured_noise(planes, capture.camera, mask, codes.collected, noise)
         warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, measured[0], device, request)
         noisier = 1.0

@@ -4,15 +4,15 @@ Pixels of a camera see about as much of a surface as they are apart, and an edge
 rendered or shrunk without a filter show points of the surface: an edge lies anywhere between two of them.
 
 The mean of all levels of a k-ary code is a level itself or lies near one: a blurred digit is read as the middle one and sure of it. Of
-stripes that are seen about two of k have the darkest and the brightest level.
+stripes that are seen about two of k have the darkest and the brightest level, or all have a colour whose channels are dark or bright.
 """
 
 import numpy as np
 
 from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of
 from kernels.structured.pattern_frames import NoiseModel
-from kernels.structured.response import light_of
 from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.pattern_checks import Sample
 from service.depth.patterns.readings import line_readings
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
@@ -24,9 +24,10 @@ PAIRS = 32
 """Number of pairs of neighbouring image rows whose edges are looked at, evenly spread."""
 LIT_SIGMAS = 20.0
 """Least difference of a bit and its inverse, in deviations of a reading, of pixels whose edges count."""
-SEEN_PART, OF_A_STEP = 0.25, 0.25
-"""Part of two of k pixels that have the darkest or the brightest level of a digit that is seen, and the distance from these levels within
-which they have it, as a part of that to the next level."""
+SEEN_PART, OF_A_STEP = {1: 0.25, 3: 0.02}, {1: 0.25, 3: 0.4}
+"""By the number of channels, the least part of the pixels with outer levels, over that of the stripes with them, of a digit that is seen,
+and the distance from these levels within which they have it, as a part of that to the next level. Colours are told by all channels
+together: half of the pixels may see two stripes."""
 FEW_EDGES = 16
 """Number of edges that count as seen by pixels as wide as they are apart, so that few edges tell nothing."""
 
@@ -53,22 +54,23 @@ def measured_edge_error(planes: Planes, mask: np.ndarray, collected: Collected, 
     return edge_error_of(whole / seen)
 
 
-def unseen_digits(planes: Planes, mask: np.ndarray, collected: Collected, projector: PatternProjector,
-                  noise: NoiseModel) -> tuple[int, int]:
-    """Return how many of the finest digits of k-ary codes in grey levels, along columns and along rows, the camera does not resolve."""
+def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> tuple[int, int]:
+    """Return how many of the finest digits of k-ary codes, along columns and along rows, the camera does not resolve."""
     found: dict[Axis, int] = {"column": 0, "row": 0}
-    codes = [code for code in collected.codes if isinstance(code, KaryCode) and code.levels is not None]
-    if not codes or collected.white is None or collected.black is None:
-        return 0, 0
-    grey, inside = _pairs_of_rows(planes, mask)
-    white, black = grey[collected.white], grey[collected.black]
-    lit = inside & (white - black > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(white, 0)))
-    for code in codes:
-        levels = np.sort(light_of(projector.response, np.array(code.levels)))
-        dark, bright = levels[0] + OF_A_STEP * (levels[1] - levels[0]), levels[-1] - OF_A_STEP * (levels[-1] - levels[-2])
+    for code in collected.codes:
+        if not isinstance(code, KaryCode) or collected.white is None or collected.black is None:
+            continue
+        levels, light = projector.levels_of(code), sample.digit_light(code)
+        own = np.array(code.colors) if code.colors is not None else levels
+        outer = np.flatnonzero(((own == own.min(axis=0)) | (own == own.max(axis=0))).all(axis=1))
+        white, black = light[collected.white], light[collected.black]
+        lit = sample.whole & (white - black > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(white, 0))).all(axis=0)
+        apart = np.abs(levels[:, None] - levels).max(axis=2)
+        reach = OF_A_STEP[light.shape[1]] * np.where(np.eye(code.base, dtype=bool), np.inf, apart).min(axis=1)
         for number in code.frames[:-1] if lit.any() else ():
-            part = (grey[number] - black)[lit] / (white - black)[lit]
-            if ((part < dark) | (part > bright)).mean() > SEEN_PART * 2 / code.base:
+            part = np.clip(((light[number] - black) / np.maximum(white - black, 1e-9))[:, lit].T, levels.min(axis=0), levels.max(axis=0))
+            seen = np.any([np.abs(part - levels[level]).max(axis=1) < reach[level] for level in outer], axis=0)
+            if seen.mean() > SEEN_PART[light.shape[1]] * len(outer) / code.base:
                 break
             found[code.axis] += 1
     return found["column"], found["row"]
