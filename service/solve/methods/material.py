@@ -33,6 +33,7 @@ from kernels.photometric.search.survey import QUICK
 from kernels.photometric.shadows.bounce import bounce_albedo
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
+from service.requests.solve import Method
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import Solution, SolveInput, half
@@ -51,8 +52,8 @@ SHARED_PAIRS = 384
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
 PRIOR_STRENGTH = 10.0
-"""Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
-for a reading that misfits by the noise floor of the search."""
+"""Strength of the prior towards the normals of a simpler method where the general solver is not supported: a standard deviation of some
+degrees for a reading that misfits by the noise floor of the search."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,8 @@ class _Walk:
         self.result = Solution.empty(count)
         self._specular = self.result.specular = np.zeros((3, count), np.float16)
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
-        self._lambertian = np.zeros_like(self.result.normal)
+        self._simple = np.zeros_like(self.result.normal)  # normals that it is drawn to where few lights do not support more
+        self._robust = self.result.normal
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
         self._shape, self._lobe, self._supported = Diffuse(), Diffuse(), True
 
@@ -132,11 +134,13 @@ class _Walk:
                 grey = grey_readings(band, grey_factors(self._lights, GREY_WEIGHTS))
                 fit = solve_lambert(band, grey, self._lights.direction, near)
                 status, normal = (to_numpy(each) for each in (fit.status, fit.normal))
-                self._lambertian[:, span] = np.where(status[: len(inside)] == Status.OK, normal[:, : len(inside)],
+                self._simple[:, span] = np.where(status[: len(inside)] == Status.OK, normal[:, : len(inside)],
                                                      self.result.normal[:, span])
 
         each_band(self._given, self._lights, self._field, begin,
-                  Results((self.result.normal, self.result.residual, self.result.status, self._lambertian)))
+                  Results((self.result.normal, self.result.residual, self.result.status, self._simple)))
+        if self._few:
+            self._robust = self.result.normal.copy()
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
         self._spread = self._solvable[evenly(len(self._solvable), LOBE_PIXELS)] if len(self._solvable) else self._solvable
 
@@ -153,9 +157,13 @@ class _Walk:
         self._given.timings.stage("shape", 1)
         if not len(self._spread):
             return
-        samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._few:
-            self._supported = supports_lobes(self.result, samples, normal, matt=self._matt)
+            start = pair_starts(self._solved, LOBE_PIXELS)
+            pixels = np.concatenate([start, start + APART]) if len(start) else np.tile(self._spread, 2)
+            simpler = supports_lobes(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
+            self._supported = simpler is None
+            self._simple = self._robust if simpler is Method.ROBUST else self._simple
+        samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._supported:
             shapes = choose_diffuse(samples, normal)
             self._shape, self._lobe = shapes.mean, shapes.best
@@ -167,7 +175,7 @@ class _Walk:
 
         def search(batch: Batch) -> None:
             pixels, samples = batch
-            start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
+            start = result.normal[:, pixels] if self._supported else self._simple[:, pixels]
             found = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels), sweep=QUICK)
             normal = found.best.normal
             result.normal[:, pixels] = normal.T
@@ -183,7 +191,7 @@ class _Walk:
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
-        solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
+        solved = self._solved
         material = Material(self.result.albedo.copy(), self._specular.copy(), self._roughness.copy())
         light = direct_light(self._given, self._lights, self._field, self.result.normal, material, self._bouncing, solved,
                              shadows=self._options.shadows, interreflection=self._interreflection,
@@ -291,8 +299,7 @@ class _Walk:
 
     def _shared_misfit(self, light: DirectLight | None) -> float:
         """Return the share of the misfit that neighbouring pixels have in common."""
-        solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
-        start = pair_starts(solved, SHARED_PAIRS)
+        start = pair_starts(self._solved, SHARED_PAIRS)
         if light is None or not len(start):
             return UNKNOWN_SHARE
         pixels = np.concatenate([start, start + APART])
@@ -300,6 +307,11 @@ class _Walk:
         shared = shared_misfit(samples, descend(samples, self.result.normal[:, pixels].T, shape=self._shape), shape=self._shape)
         self.result.facts["shared_misfit"] = round(shared, 4)
         return shared
+
+    @property
+    def _solved(self) -> np.ndarray:
+        """Return [rows, cols] bool, which pixels have a normal."""
+        return (self.result.status == Status.OK).reshape(self._given.mask.shape)
 
     @property
     def _seeks_metals(self) -> bool:
@@ -319,7 +331,7 @@ class _Walk:
 
     def _prior(self, pixels: np.ndarray) -> Prior | None:
         """Return what is expected of the normals of some pixels."""
-        return None if self._supported else Prior(self._lambertian[:, pixels].T, PRIOR_STRENGTH)
+        return None if self._supported else Prior(self._simple[:, pixels].T, PRIOR_STRENGTH)
 
     def _pick(self, pixels: np.ndarray) -> Samples:
         """Return the readings of a few pixels, wherever they lie in the image."""

@@ -11,59 +11,104 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.lambertian.robust import (
+    BRIGHT_FRACTION,
+    BRIGHT_RANKS,
+    CAUCHY_SCALE,
+    DARK_RANKS,
+    KEPT_AT_LEAST,
+    REWEIGHTINGS,
+    SHADOW_FRACTION,
+)
 from kernels.photometric.model.samples import Samples, device_values, host_values, host_vectors
 from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
+from service.requests.solve import Method
 from service.solve.base.solution import Solution, raise_error
 
 PARTS = 12
 """Number of parts into which the lights are divided, each left out once; fewer lights are left out singly."""
 RIDGE = 1e-6
 """Added to the diagonal of the normal equations, so that coplanar lights give a solution."""
+SHARED = 0.15
+"""Correlation of what is left at neighbouring pixels below which it is noise, which sigma holds: 0.02 to 0.11 under noise, 0.2 where the
+camera shakes, and 0.5 to 0.95 of velvet, wrong lights and images that are not linear."""
+OUTLYING = 3.0
+"""Residual, in units of the noise of the cost, that larger ones count as where those of neighbours are compared."""
 
 
 class LeftOut(NamedTuple):
-    """Mean cost of the left-out readings, as the search counts it."""
+    """Mean cost of the left-out readings at the first pixels of pairs, as the search counts it."""
 
     general: float
     """The readings as the mixture of lobes predicts them."""
     lambert: float
-    """The readings as Lambert's law predicts them."""
+    """The readings as Lambert's law predicts them, fitted by least squares."""
+    robust: float
+    """The same, fitted to middle ranks."""
+    shared: float
+    """Correlation of what the best of the three leaves at neighbouring pixels: near 0 for noise."""
 
 
 def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     """Predict the readings of each light from those of the others.
-    `samples`: some hundreds of pixels, spread over the object, under four lights or more. `start`: [n, 3] unit normals to begin from."""
+    `samples`: pairs of neighbouring pixels, some hundreds that are spread over the object, the first ones of all pairs, then the second
+    ones, under four lights or more. `start`: [n, 3] unit normals to begin from."""
     lights = samples.light_count
     readings = host_values(samples, samples.grey).astype(np.float64)
     toward = np.moveaxis(host_vectors(samples, samples.toward), 0, -1).astype(np.float64, order="C")
     parts = min(PARTS, lights)
-    costs: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    predicted = np.zeros((3, *readings.shape))
     for part in range(parts):
         out = np.arange(lights) % parts == part
         kept = np.where(out, -1.0, readings)
-        lambertian = _lambert(kept, toward)
         rest = samples._replace(grey=device_values(samples, kept))
         found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
-        general = predict(samples, found.normal, found.weights, shape=Diffuse())
-        given = readings[:, out] >= 0
-        for kept_costs, predicted in zip(costs, (general, np.einsum("nlc,nc->nl", toward, lambertian)), strict=True):
-            kept_costs.append(_cost(readings[:, out], np.maximum(predicted[:, out], 0))[given])
-    return LeftOut(*(float(np.concatenate(each).mean()) if sum(map(len, each)) else 0.0 for each in costs))
+        predicted[0][:, out] = predict(samples, found.normal, found.weights, shape=Diffuse())[:, out]
+        for model, weights in ((1, (kept > 0).astype(np.float64)), (2, _middle(kept))):
+            b = _least_squares(kept, toward, weights)
+            for _ in range(REWEIGHTINGS if model == 2 else 0):
+                off = kept - np.einsum("nlc,nc->nl", toward, b)
+                b = _least_squares(kept, toward, weights / (1 + (off / (CAUCHY_SCALE * np.linalg.norm(b, axis=1)[:, None] + RIDGE)) ** 2))
+            predicted[model][:, out] = np.maximum(np.einsum("nlc,nc->nl", toward[:, out], b), 0)
+    given = readings >= 0
+    count = len(readings) // 2
+    if not given[:count].any():
+        return LeftOut(0.0, 0.0, 0.0, 0.0)
+    costs = [float(_cost(readings, each)[:count][given[:count]].mean()) for each in predicted]
+    left = np.where(given, np.clip((readings - predicted[int(np.argmin(costs))]) / _noise(readings), -OUTLYING, OUTLYING), 0)
+    first, second = left.reshape(2, count, -1)
+    shared = float((first * second).sum()) / max(0.5 * float((left**2).sum()), 1e-30)
+    return LeftOut(costs[0], costs[1], costs[2], shared)
 
 
-def _lambert(readings: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """Return [n, 3] the least-squares b of b·l = reading over the readings above zero."""
-    weights = (readings > 0).astype(np.float64)
+def _middle(readings: np.ndarray) -> np.ndarray:
+    """Return 1 for readings [n, lights] of the middle ranks, as of `solve_robust`, and 0 for others."""
+    lit = readings > SHADOW_FRACTION * np.quantile(np.maximum(readings, 0), 1 - BRIGHT_FRACTION, axis=1, keepdims=True)
+    count = lit.sum(axis=1, keepdims=True)
+    share = np.minimum(1, np.maximum(count - KEPT_AT_LEAST, 0) / np.maximum((DARK_RANKS + BRIGHT_RANKS) * count, 1))
+    rank = np.where(lit, readings, -np.inf).argsort(axis=1).argsort(axis=1) - (readings.shape[1] - count)  # from the darkest lit one
+    kept = (rank >= np.floor(share * DARK_RANKS * count)) & (rank < count - np.floor(share * BRIGHT_RANKS * count))
+    return kept.astype(np.float64)
+
+
+def _least_squares(readings: np.ndarray, toward: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return [n, 3] the least-squares b of b·l = reading."""
     gram = np.einsum("nl,nli,nlj->nij", weights, toward, toward) + RIDGE * np.eye(3)
     return np.linalg.solve(gram, np.einsum("nl,nli->ni", weights * readings, toward)[..., None])[..., 0]
+
+
+def _noise(readings: np.ndarray) -> np.ndarray:
+    """Return the deviation of each reading that the search expects."""
+    options = SearchOptions()
+    return np.asarray(options.noise_floor + options.noise_slope * np.maximum(readings, 0))
 
 
 def _cost(readings: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Return the cost of each reading as the search counts it."""
     options = SearchOptions()
-    squared = ((readings - predicted) / (options.noise_floor + options.noise_slope * np.maximum(readings, 0))) ** 2
+    squared = ((readings - predicted) / _noise(readings)) ** 2
     dark = (readings < options.shadow_depth * predicted) & (squared > np.expm1(options.shadow_cost))
     return np.where(dark, options.shadow_cost, np.log1p(squared))
 
@@ -88,28 +133,35 @@ def is_supported(general: float, lambert: float) -> bool:
     return general <= (SUPPORTED_RATIO if min(general, lambert) < UNDESCRIBED else UNDESCRIBED_RATIO) * lambert
 
 
-def supports_lobes(result: Solution, samples: Samples, start: np.ndarray, *, matt: bool) -> bool:
-    """Return whether few lights support the general solver, and say in the solution what speaks against it; parameters as of leave_out.
+def supports_lobes(result: Solution, samples: Samples, start: np.ndarray, *, matt: bool) -> Method | None:
+    """Return None where few lights support the general solver, else the method that predicts better, LAMBERT or ROBUST, and say in the
+    solution what speaks against the general one; parameters as of leave_out.
     `matt`: the images hold diffuse light alone, so that no specular lobe is expected."""
     count = samples.light_count
-    fallback = (f"normals are drawn to those of lambert{'' if matt else ' and no specular lobe is estimated'}; capture 32 lights or more, "
-                "spread over the hemisphere, or take --method robust")
+
+    def fall_back(reason: str, method: Method) -> Method:
+        result.warnings.append(f"method svbrdf: {reason}: normals are drawn to those of {method.value}"
+                               f"{'' if matt else ' and no specular lobe is estimated'}; capture 32 lights or more, spread over the "
+                               "hemisphere, or take --method robust.")
+        return method
+
     if count < TESTED_LIGHTS:
-        result.warnings.append(f"method svbrdf: {count} lights are fewer than the unknowns of a pixel: {fallback}.")
-        return False
-    general, lambert = (round(cost, 4) for cost in leave_out(samples, start))
-    result.facts |= {"left_out_misfit": general, "left_out_misfit_lambert": lambert}
-    supported = is_supported(general, lambert)
-    if not supported:
-        result.warnings.append(f"method svbrdf: the images of left-out lights are predicted hardly better with specular lobes than without "
-                               f"(misfit {general:.2g} against {lambert:.2g}): {fallback}.")
-    return supported
+        return fall_back(f"{count} lights are fewer than the unknowns of a pixel", Method.LAMBERT)
+    general, lambert, robust, shared = (round(cost, 4) for cost in leave_out(samples, start))
+    result.facts |= {"left_out_misfit": general, "left_out_misfit_lambert": lambert, "left_out_misfit_robust": robust,
+                     "left_out_shared": shared}
+    if is_supported(general, lambert):
+        return None
+    return fall_back(f"the images of left-out lights are predicted hardly better with specular lobes than without (misfit {general:.2g} "
+                     f"against {lambert:.2g})", Method.ROBUST if robust < lambert else Method.LAMBERT)
 
 
 def raise_undescribed(solution: Solution) -> None:
     """Make normals less sure, and say so, where the readings of left-out lights are predicted by no model."""
-    general, lambert = (solution.facts.get(name) for name in ("left_out_misfit", "left_out_misfit_lambert"))
-    if general is None or lambert is None or is_supported(general, lambert) or min(general, lambert) < UNDESCRIBED:
+    if "left_out_misfit" not in solution.facts:
+        return
+    general, lambert, shared = (solution.facts[name] for name in ("left_out_misfit", "left_out_misfit_lambert", "left_out_shared"))
+    if is_supported(general, lambert) or min(general, lambert) < UNDESCRIBED or shared < SHARED:
         return
     raise_error(solution, DEGREES * min(general, lambert))
     solution.warnings.append("method svbrdf: the object reflects neither by Lambert's law nor with highlights, as velvet does not: the "
