@@ -51,6 +51,8 @@ class Case:
     accuracy_deg: float | None = None
     drift_px: float = 0.0
     """By how much the camera drifts during the sweep."""
+    slipped: tuple[int, int] = (0, 0)
+    """Frames from the first of which on, and before the second, each shows the plane of the frame before."""
 
 
 def grey(points: np.ndarray) -> np.ndarray:
@@ -88,6 +90,8 @@ CASES = (
     Case("a second plane in every eighth frame", cloth, planes=60, in_model=False, second=0.7, second_every=8),
     Case("a faint second plane in every fifth frame", grain, planes=60, in_model=False, second=0.2, second_every=5),
     Case("planes declared one frame late", cloth, planes=60, in_model=False, late=1),
+    Case("one frame taken twice, the later ones late", cloth, planes=60, in_model=False, slipped=(25, 60)),
+    Case("one frame taken twice in place of the next", cloth, planes=60, in_model=False, slipped=(25, 26)),
     Case("planes declared in reverse order", cloth, planes=60, in_model=False, backwards=True),
     Case("planes declared 1° aside", grain, planes=60, in_model=False, turned_rad=float(np.radians(1))),
     Case("planes declared 1° aside, accuracy_deg 1", grain, planes=60, turned_rad=float(np.radians(1)), accuracy_deg=1.0),
@@ -146,11 +150,13 @@ def swept(case: Case, seed: int = 5) -> Trial:
     whole = np.ptp(inside, axis=-1) < 0.02
     with tempfile.TemporaryDirectory() as name:
         folder, frames = Path(name), []
-        for index, angle in enumerate([*np.linspace(first, last, case.planes), None]):
+        angles = [*np.linspace(first, last, case.planes), None]
+        for index, angle in enumerate(angles):
             image = 0.03 * albedo
+            shown = angles[index - 1] if case.slipped[0] <= index < case.slipped[1] else angle
             for turn, strength in ((0.0, 1.0), (case.second_rad, case.second if index % case.second_every == 0 else 0.0)):
-                if angle is not None and strength > 0:
-                    off = (away @ plane_normal(angle + turn)) / distance / BEAM_RAD
+                if shown is not None and strength > 0:
+                    off = (away @ plane_normal(shown + turn)) / distance / BEAM_RAD
                     image = image + 0.6 * strength * albedo * cosine * np.exp(-0.5 * off**2)
             pixel = image.reshape(ROWS, DOWN, COLS, ACROSS).mean(axis=(1, 3))
             if case.drift_px:

@@ -11,6 +11,7 @@ import numpy as np
 from kernels.status import Status
 from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
+from service.depth.laser.missed_planes import missed_sentence, missteps, widen_missed
 from service.depth.laser.spot import find_spot, nearest_points
 from service.depth.laser.steady import Moves, widen_moved
 from service.depth.laser.stripe_curves import WHOLE
@@ -94,6 +95,13 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         for along in samples:
             own = moved[np.array(stripes) == along]
             samples[along] = widen_moved(samples[along], _planes(capture, along), own, camera, along=along)
+    said = []
+    for along in samples:
+        steps = missteps(samples[along], planes := _planes(capture, along), camera, along=along)
+        if steps:
+            samples[along] = widen_missed(samples[along], planes, steps, camera, along=along)
+            said.append(missed_sentence(steps, [frame.image for frame in frames
+                                                if isinstance(frame.laser, LaserPlane) and along_of(frame.laser) == along]))
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
     one_sweep = [sentence for along in kept if (sentence := unconfirmed(samples[along], _planes(capture, along), camera, along=along))]
     for along, part in kept.items():
@@ -116,6 +124,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     solution = _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
     if "sweeps_differ_m" not in solution.facts and any(plane.accuracy_deg is None for along in kept for plane in _planes(capture, along)):
         solution.warnings += one_sweep[:1]
+    solution.warnings += said
     if moved is not None:
         size = float(np.hypot(*moved.T).max())
         solution.facts["image_shift_px"] = float(f"{size:.3g}")

@@ -142,6 +142,18 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
     return found
 
 
+def plane_cuts(line: np.ndarray, place: np.ndarray, planes: Sequence[LaserPlane], number: np.ndarray, camera: Camera, depth: float, *,
+               along: str) -> np.ndarray:
+    """Return where planes cut lines at a depth in metres, along the lines in the plane 1 m away, [n].
+    `line`, `place`: [n] of stripes. `number`: [n] int, which of the planes each is of."""
+    x, y = camera.plane_at(*((place, line + 0.5) if along == "row" else (line + 0.5, place)))
+    normal, distance = np.array([plane.normal for plane in planes]), np.array([np.dot(plane.point_m, plane.normal) for plane in planes])
+    own, other, across = (0, 1, y) if along == "row" else (1, 0, x)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = (distance[number] / depth + normal[number, 2] - normal[number, other] * across) / normal[number, own]
+    return np.asarray(cut if along == "row" else -cut)  # v runs down
+
+
 def concordance(samples: StripeSamples, frame: np.ndarray, planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> float:
     """Return how far stripes move as their planes do, from 1 (all) to -1 (all move the other way); NaN if too few lines tell.
 
@@ -153,12 +165,7 @@ def concordance(samples: StripeSamples, frame: np.ndarray, planes: Sequence[Lase
     deep = samples.depth[seen][samples.depth[seen] > 0]
     middle = float(np.median(deep)) if deep.size else 1.0
     line, place, number = samples.line[seen], samples.place[seen], frame[seen]
-    x, y = camera.plane_at(*((place, line + 0.5) if along == "row" else (line + 0.5, place)))
-    normal, distance = np.array([plane.normal for plane in planes]), np.array([np.dot(plane.point_m, plane.normal) for plane in planes])
-    own, other, across = (0, 1, y) if along == "row" else (1, 0, x)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cut = (distance[number] / middle + normal[number, 2] - normal[number, other] * across) / normal[number, own]
-    cut = cut if along == "row" else -cut  # v runs down
+    cut = plane_cuts(line, place, planes, number, camera, middle, along=along)
     signs = []
     for one in np.unique(line):
         here = np.flatnonzero((line == one) & np.isfinite(cut))
