@@ -33,8 +33,9 @@ LEAST_ERRORS, LARGEST_ERROR, MOST = 5.0, 0.02, 0.5
 is glare: where albedo hardly varies, standard errors are 0.02 to 9."""
 LEAST_DEGREES, LEAST_SHARE = 1.0, 0.01
 """What is said turns normals by this angle, in this part of the pixels."""
-LEAST_ALBEDO = 1e-3
+LEAST_ALBEDO, TINY = 1e-3, 1e-12
 ROUNDS = 10
+"""Rounds of re-weighting."""
 
 
 class Veil(NamedTuple):
@@ -83,7 +84,7 @@ def find_veil(given: SolveInput, lights: DistantLights, solution: Solution) -> V
              if len((fits := _fit(readings, over)).pixels) >= LEAST_PIXELS]
     if not found:
         return None
-    fits, part, error = max(found, key=lambda each: each[1] / each[2])
+    fits, part, error = max(found, key=lambda each: each[1] / max(each[2], TINY))
     if not LEAST_ERRORS * error < part < MOST or error > LARGEST_ERROR:
         return None
     albedo = np.maximum(solution.albedo.mean(axis=0, dtype=np.float32), LEAST_ALBEDO)

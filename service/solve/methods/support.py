@@ -65,7 +65,7 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
         kept = np.where(out, -1.0, readings)
         rest = samples._replace(grey=device_values(samples, kept))
         found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
-        predicted[0][:, out] = predict(samples, found.normal, found.weights, shape=Diffuse())[:, out]
+        predicted[0][:, out] = np.maximum(predict(samples, found.normal, found.weights, shape=Diffuse())[:, out], 0)
         for model, weights in ((1, (kept > 0).astype(np.float64)), (2, _middle(kept))):
             b = _least_squares(kept, toward, weights)
             for _ in range(REWEIGHTINGS if model == 2 else 0):
