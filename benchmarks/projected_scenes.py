@@ -279,10 +279,7 @@ def _focus(shown: np.ndarray, blur_px: float) -> np.ndarray:
     reach = int(np.ceil(4 * blur_px))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur_px) ** 2)
     kernel /= kernel.sum()
-    for axis in (0, 1):
-        padded = np.pad(shown, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        shown = sum(k * np.take(padded, np.arange(shown.shape[axis]) + i, axis=axis) for i, k in enumerate(kernel))
-    return shown
+    return np.asarray(convolve1d(convolve1d(shown, kernel, axis=0, mode="nearest"), kernel, axis=1, mode="nearest"))
 
 
 def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, light: Light | None = None,
