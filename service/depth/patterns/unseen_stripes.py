@@ -67,7 +67,7 @@ def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjec
         lit = sample.whole & (white - black > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(white, 0))).all(axis=0)
         apart = np.abs(levels[:, None] - levels).max(axis=2)
         reach = OF_A_STEP[light.shape[1]] * np.where(np.eye(code.base, dtype=bool), np.inf, apart).min(axis=1)
-        for number in code.frames[:-1] if lit.any() else ():
+        for number in code.frames[:-1] if lit.any() and len(outer) else ():
             part = np.clip(((light[number] - black) / np.maximum(white - black, 1e-9))[:, lit].T, levels.min(axis=0), levels.max(axis=0))
             seen = np.any([np.abs(part - levels[level]).max(axis=1) < reach[level] for level in outer], axis=0)
             if seen.mean() > SEEN_PART[light.shape[1]] * len(outer) / code.base:

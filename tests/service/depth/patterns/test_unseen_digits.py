@@ -36,6 +36,14 @@ def test_colours_that_are_not_resolved_are_left_out(tmp_path, light, base, refle
         True] * (digits > 0)
 
 
+def test_colours_between_dark_and_bright_tell_nothing(tmp_path, light):
+    """A palette without a colour whose channels are all dark or bright: no digit is left out."""
+    colors = [(1.0, 0.5, 0.0), (0.0, 1.0, 0.5), (0.5, 0.0, 1.0)]
+    found, off = solved(tmp_path, World(shapes=SHAPES), light, kary_patterns(320, "column", base=3, stripe_px=3, colors=colors))
+    assert not [warning for warning in found.warnings if "does not resolve" in warning]
+    assert (off > 5).mean() < 0.01 and len(off) > 0.9 * (light.lit & np.isfinite(light.depth)).sum()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("base", [4, 8])
 @pytest.mark.parametrize("stripe_px", [1, 3])
