@@ -53,6 +53,10 @@ class SearchOptions:
     shadow_depth: float = 0.3
     """Fraction of its prediction below which a reading may be a cast shadow."""
 
+    def noise(self, readings: np.ndarray) -> np.ndarray:
+        """Return the deviation of readings that is expected, in their unit."""
+        return np.asarray(self.noise_floor + self.noise_slope * np.maximum(readings, 0))
+
 
 @dataclass(frozen=True, kw_only=True)
 class RingOptions(SearchOptions):

@@ -39,7 +39,7 @@ def shared_misfit(samples: Samples, found: Descent, *, shape: Diffuse) -> float:
         return 0.0
     reading = host_values(samples, samples.grey).astype(np.float64)
     predicted = predict(samples, found.normal, found.weights, shape=shape)
-    residual = (reading - predicted) / (options.noise_floor + options.noise_slope * np.maximum(reading, 0))
+    residual = (reading - predicted) / options.noise(reading)
     counts = (reading > DARK) & (np.abs(residual) < OUTLYING) & (reading > options.shadow_depth * predicted)
     first, second = np.where(counts, residual, 0).reshape(2, count, -1)[:, explained]
     common, total = np.median((first * second).sum(axis=1)), np.median(0.5 * (first**2 + second**2).sum(axis=1))

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.status import Status
-from kernels.structured.stripe import plane_depths
 from service.depth.laser.stripe_map import StripeSamples, plane_cuts
 from stage.capture.camera import Camera
 from stage.capture.light import LaserPlane
@@ -40,17 +39,14 @@ class Misstep(NamedTuple):
 def missteps(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> list[Misstep]:
     """Return the steps at which a sweep of planes is out of step with its images.
     `samples`, `planes`: of each frame whose stripe crosses the same lines, in order."""
-    lines = 1 + max((int(part.line.max()) for part in samples if len(part.line)), default=-1)
-    if len(samples) < 2 * AROUND + 2 or lines < LEAST_LINES:
+    if len(samples) < 2 * AROUND + 2:
         return []
-    deep = np.concatenate([part.depth[part.depth > 0] for part in samples])
-    middle_m = float(np.median(deep)) if len(deep) else 1.0
-    place, cut = np.full((2, len(samples), lines), np.nan)
-    for number, part in enumerate(samples):
-        seen = (part.status == Status.OK) & np.isfinite(part.place)
-        place[number, part.line[seen]] = part.place[seen]
-        cut[number, part.line[seen]] = plane_cuts(part.line[seen], part.place[seen], planes[number : number + 1], np.zeros(seen.sum(), int),
-                                                  camera, middle_m, along=along)
+    whole = StripeSamples.joined(samples)
+    seen = (whole.status == Status.OK) & np.isfinite(whole.place)
+    whole, frame = whole.where(seen), np.repeat(np.arange(len(samples)), [len(part.line) for part in samples])[seen]
+    place, cut = np.full((2, len(samples), int(whole.line.max(initial=0)) + 1), np.nan)
+    place[frame, whole.line] = whole.place
+    cut[frame, whole.line] = plane_cuts(whole, frame, planes, camera, along=along)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.diff(place, axis=0) / np.diff(cut, axis=0)
     found = []
@@ -74,15 +70,12 @@ def widen_missed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane],
     for step in steps:
         aside[step.frame :] += step.planes - 1
     likely = [value for value, count in zip(*np.unique(aside, return_counts=True), strict=True) if count >= SHARE * len(aside)]
-    widened = []
+    widened = list(samples)
     for number, part in enumerate(samples):
         away = max((abs(int(aside[number]) - int(value)) for value in likely), default=0)
-        other = planes[number + away if number + away < len(planes) else max(number - away, 0)]
-        u, v = (part.place, part.line + 0.5) if along == "row" else (part.line + 0.5, part.place)
-        x, y = camera.plane_at(u.astype(np.float64), v.astype(np.float64))
-        with np.errstate(invalid="ignore"):
-            off = np.abs(plane_depths(x, y, np.array(other.point_m), np.array(other.normal), along=along).depth - part.depth)
-        widened.append(part._replace(sigma=np.where((part.depth > 0) & (away > 0), np.hypot(part.sigma, np.nan_to_num(off)), part.sigma)))
+        if away:
+            other = planes[number + away if number + away < len(planes) else max(number - away, 0)]
+            widened[number] = part.widened(part.depth_change(other, camera, along=along))
     return widened
 
 

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter, shift
 
-from kernels.structured.stripe import plane_depths
 from service.depth.laser.stripe_map import StripeSamples
 from service.depth.laser.stripes import Signal
 from stage.capture.camera import Camera
@@ -93,11 +92,5 @@ def _blocks(image: np.ndarray) -> np.ndarray:
 def widen_moved(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], moves: np.ndarray, camera: Camera, *,
                 along: str) -> list[StripeSamples]:
     """Add to the deviations of each frame's samples what its move, [frames, 2] pixels across and down, makes of their depths."""
-    widened = []
-    for part, plane, (across, down) in zip(samples, planes, moves, strict=True):
-        u, v = (part.place, part.line + 0.5) if along == "row" else (part.line + 0.5, part.place)
-        x, y = camera.plane_at(u.astype(np.float64) - across, v.astype(np.float64) - down)
-        with np.errstate(invalid="ignore"):
-            off = np.abs(plane_depths(x, y, np.array(plane.point_m), np.array(plane.normal), along=along).depth - part.depth)
-        widened.append(part._replace(sigma=np.where(part.depth > 0, np.hypot(part.sigma, np.nan_to_num(off)), part.sigma)))
-    return widened
+    return [part.widened(part.depth_change(plane, camera, along=along, across=across, down=down))
+            for part, plane, (across, down) in zip(samples, planes, moves, strict=True)]

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.status import Status
+from kernels.structured.stripe import plane_depths
 from service.depth.laser.stripe_curves import RIVAL, WHOLE
 from stage.capture.camera import Camera
 from stage.capture.light import LaserPlane
@@ -43,6 +44,26 @@ class StripeSamples(NamedTuple):
     def joined(cls, parts: Sequence["StripeSamples"]) -> "StripeSamples":
         """Return the samples of several frames together."""
         return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def where(self, kept: np.ndarray) -> "StripeSamples":
+        """Return some of the samples, [n] bool."""
+        return StripeSamples(*(values[kept] for values in self))
+
+    def rays(self, camera: Camera, *, along: str, across: float = 0.0, down: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the rays of the stripes meet the plane 1 m away, x and y [n].
+        `across`, `down`: pixels by which the image of the stripes lies aside."""
+        u, v = (self.place, self.line + 0.5) if along == "row" else (self.line + 0.5, self.place)
+        return camera.plane_at(u.astype(np.float64) - across, v.astype(np.float64) - down)
+
+    def depth_change(self, plane: LaserPlane, camera: Camera, *, along: str, across: float = 0.0, down: float = 0.0) -> np.ndarray:
+        """Return by how much the depths differ, metres [n], where the stripes are those of a plane, in images that lie aside."""
+        x, y = self.rays(camera, along=along, across=across, down=down)
+        with np.errstate(invalid="ignore"):
+            return np.abs(plane_depths(x, y, np.array(plane.point_m), np.array(plane.normal), along=along).depth - self.depth)
+
+    def widened(self, change_m: np.ndarray) -> "StripeSamples":
+        """Return the samples with changes of their depths, metres [n], added to their deviations; NaN adds nothing."""
+        return self._replace(sigma=np.where(self.depth > 0, np.hypot(self.sigma, np.nan_to_num(change_m)), self.sigma))
 
 
 class StripeMap(NamedTuple):
@@ -142,15 +163,16 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
     return found
 
 
-def plane_cuts(line: np.ndarray, place: np.ndarray, planes: Sequence[LaserPlane], number: np.ndarray, camera: Camera, depth: float, *,
-               along: str) -> np.ndarray:
-    """Return where planes cut lines at a depth in metres, along the lines in the plane 1 m away, [n].
-    `line`, `place`: [n] of stripes. `number`: [n] int, which of the planes each is of."""
-    x, y = camera.plane_at(*((place, line + 0.5) if along == "row" else (line + 0.5, place)))
+def plane_cuts(samples: StripeSamples, frame: np.ndarray, planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> np.ndarray:
+    """Return where the planes of stripes cut their lines at the median depth, along the lines in the plane 1 m away, [n].
+    `frame`: [n] int, which of the planes each sample is of."""
+    x, y = samples.rays(camera, along=along)
+    deep = samples.depth[samples.depth > 0]
+    depth = float(np.median(deep)) if deep.size else 1.0
     normal, distance = np.array([plane.normal for plane in planes]), np.array([np.dot(plane.point_m, plane.normal) for plane in planes])
     own, other, across = (0, 1, y) if along == "row" else (1, 0, x)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cut = (distance[number] / depth + normal[number, 2] - normal[number, other] * across) / normal[number, own]
+        cut = (distance[frame] / depth + normal[frame, 2] - normal[frame, other] * across) / normal[frame, own]
     return np.asarray(cut if along == "row" else -cut)  # v runs down
 
 
@@ -161,11 +183,10 @@ def concordance(samples: StripeSamples, frame: np.ndarray, planes: Sequence[Lase
     The relief of the scene shifts stripes by less than that, as a rule.
     `samples`: of all frames whose stripes cross the same lines; those that were found are compared. `frame`: [n] int, the frame of each
     sample. `planes`: of each frame."""
-    seen = np.flatnonzero(np.isin(samples.status, (Status.OK, Status.MULTIPATH, Status.OUT_OF_RANGE)) & np.isfinite(samples.place))
-    deep = samples.depth[seen][samples.depth[seen] > 0]
-    middle = float(np.median(deep)) if deep.size else 1.0
-    line, place, number = samples.line[seen], samples.place[seen], frame[seen]
-    cut = plane_cuts(line, place, planes, number, camera, middle, along=along)
+    seen = np.isin(samples.status, (Status.OK, Status.MULTIPATH, Status.OUT_OF_RANGE)) & np.isfinite(samples.place)
+    samples = samples.where(seen)
+    line, place = samples.line, samples.place
+    cut = plane_cuts(samples, frame[seen], planes, camera, along=along)
     signs = []
     for one in np.unique(line):
         here = np.flatnonzero((line == one) & np.isfinite(cut))

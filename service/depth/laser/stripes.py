@@ -285,11 +285,9 @@ def unconfirmed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], 
     turned, moved = [], []
     for index, (part, plane) in enumerate(zip(samples, planes, strict=True)):
         other = planes[index + 1 if index + 1 < len(planes) else index - 1]
-        seen = part.depth > 0
-        u, v = (part.place, part.line + 0.5) if along == "row" else (part.line + 0.5, part.place)
-        x, y = camera.plane_at(u[seen].astype(np.float64), v[seen].astype(np.float64))
-        turned.append(np.radians(1) * depth_per_turn(x, y, part.depth[seen], plane))
-        moved.append(np.abs(plane_depths(x, y, np.array(other.point_m), np.array(other.normal), along=along).depth - part.depth[seen]))
+        shown = part.where(part.depth > 0)
+        turned.append(np.radians(1) * depth_per_turn(*shown.rays(camera, along=along), shown.depth, plane))
+        moved.append(shown.depth_change(other, camera, along=along))
     if not turned or not np.isfinite(np.concatenate(turned)).any():
         return None
     degree, one_frame, aside = 1000 * float(np.nanmedian(np.concatenate(turned))), np.concatenate(moved), ""

@@ -77,7 +77,7 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     if not given[:count].any():
         return LeftOut(0.0, 0.0, 0.0, 0.0)
     costs = [float(_cost(readings, each)[:count][given[:count]].mean()) for each in predicted]
-    left = np.where(given, np.clip((readings - predicted[int(np.argmin(costs))]) / _noise(readings), -OUTLYING, OUTLYING), 0)
+    left = np.where(given, np.clip((readings - predicted[int(np.argmin(costs))]) / SearchOptions().noise(readings), -OUTLYING, OUTLYING), 0)
     first, second = left.reshape(2, count, -1)
     shared = float((first * second).sum()) / max(0.5 * float((left**2).sum()), 1e-30)
     return LeftOut(costs[0], costs[1], costs[2], shared)
@@ -99,16 +99,10 @@ def _least_squares(readings: np.ndarray, toward: np.ndarray, weights: np.ndarray
     return np.linalg.solve(gram, np.einsum("nl,nli->ni", weights * readings, toward)[..., None])[..., 0]
 
 
-def _noise(readings: np.ndarray) -> np.ndarray:
-    """Return the deviation of each reading that the search expects."""
-    options = SearchOptions()
-    return np.asarray(options.noise_floor + options.noise_slope * np.maximum(readings, 0))
-
-
 def _cost(readings: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Return the cost of each reading as the search counts it."""
     options = SearchOptions()
-    squared = ((readings - predicted) / _noise(readings)) ** 2
+    squared = ((readings - predicted) / options.noise(readings)) ** 2
     dark = (readings < options.shadow_depth * predicted) & (squared > np.expm1(options.shadow_cost))
     return np.where(dark, options.shadow_cost, np.log1p(squared))
 
