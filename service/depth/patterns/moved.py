@@ -10,7 +10,7 @@ import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.levels import even_means
-from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, LIT_SIGMAS, Sample
 from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -20,8 +20,6 @@ from stage.stack.planes import Planes
 CLEAR_SIGMAS, LEAST_PART = 6.0, 0.04
 """Least difference of a sum from its usual part of white, in deviations of noise and in white, from which on a surface has moved: lamps
 flicker by less."""
-LIT_SIGMAS = 20.0
-"""Least difference of white and black, in deviations of a reading, of pixels that are compared."""
 MOST_MOVED, SAID = 0.2, 0.005
 """Parts of the compared pixels above which it is no motion of single things, and from which on it is said."""
 

@@ -53,8 +53,8 @@ BAD_FIT, BETTER_FIT = 3.0, 0.5
 FULL_PART = 0.999
 """Part of the largest reading of a sample from which on one may be clipped: corrections of the frames leave clipped ones that even."""
 LIT_SIGMAS = 20.0
-"""Least difference of the brightest and the darkest reading of a pixel, in deviations of a reading, of pixels that tell whether frames show
-their patterns."""
+"""Least difference of the brightest and the darkest reading of a pixel, or of a bit and its inverse, in deviations of a reading, of pixels
+that tell whether frames show their patterns."""
 LEAST_SIGNAL = 20.0
 """Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
 

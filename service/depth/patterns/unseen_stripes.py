@@ -12,7 +12,7 @@ import numpy as np
 from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.pattern_checks import Sample
+from service.depth.patterns.pattern_checks import LIT_SIGMAS, Sample
 from service.depth.patterns.readings import line_readings
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
@@ -22,8 +22,6 @@ from stage.stack.planes import Planes
 
 PAIRS = 32
 """Number of pairs of neighbouring image rows whose edges are looked at, evenly spread."""
-LIT_SIGMAS = 20.0
-"""Least difference of a bit and its inverse, in deviations of a reading, of pixels whose edges count."""
 SEEN_PART, OF_A_STEP = {1: 0.25, 3: 0.02}, {1: 0.25, 3: 0.4}
 """By the number of channels, the least part of the pixels with outer levels, over that of the stripes with them, of a digit that is seen,
 and the distance from these levels within which they have it, as a part of that to the next level. Colours are told by all channels
