@@ -44,7 +44,7 @@ DEEP_DATA = 0x08
 
 
 class Header(NamedTuple):
-    """The header of an EXR file: its size, its channels of all parts, and the attributes of its first part."""
+    """The header of an EXR file: the size of its display window, its channels of all parts, and the attributes of its first part."""
 
     width: int
     height: int
@@ -52,6 +52,9 @@ class Header(NamedTuple):
     metadata: dict[str, Any]
     half: frozenset[str]
     """The channels with half values."""
+    stored: tuple[int, int, int, int]
+    """The rows and columns of the display window, first ones and those behind the last, of which the file stores pixels: a part of the
+    picture, or more than it."""
 
 
 class Part(NamedTuple):
@@ -90,8 +93,8 @@ def header_of(source: inputs.Source) -> Header:
     try:
         with source.reopened() as same, OpenEXR.File(same, header_only=True) as file:
             parts = [dict(file.header(index)) for index in range(len(file.parts))]
-        windows = [tuple(int(edge) for corner in attributes["dataWindow"] for edge in corner) for attributes in parts]
-        left, top, right, bottom = windows[0]
+        windows = [_window(attributes["dataWindow"]) for attributes in parts]
+        top, left, bottom, right = _window(parts[0]["displayWindow"])
         names = tuple(channel.name for attributes in parts for channel in attributes["channels"])
         missing = missing_bytes(stream, found.table, parts)
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError) as error:
@@ -102,12 +105,16 @@ def header_of(source: inputs.Source) -> Header:
         raise ImageError(f"{path}: has parts with different data windows: give an image whose parts have one size")
     if (twice := next((name for name, count in Counter(names).items() if count > 1), None)) is not None:
         raise ImageError(f"{path}: has several parts with a channel {twice}: give an image with one view")
-    return Header(right - left + 1, bottom - top + 1, names, parts[0], found.half)
+    if right <= left or bottom <= top:
+        raise ImageError(f"{path}: has an empty display window")
+    first, cut, last, end = windows[0]
+    return Header(right - left, bottom - top, names, parts[0], found.half, (first - top, cut - left, last - top, end - left))
 
 
 def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read every channel of every part of an EXR file.
-    Returns the channels by name, each [rows, cols] in its stored type, and the attributes of the first part's header by name."""
+    Returns the channels by name, each [rows, cols] of the display window in its stored type, 0 where the file stores no pixels, and the
+    attributes of the first part's header by name."""
     with inputs.opened(path) as source:
         header = header_of(source)
         if header.width * header.height * len(header.channels) >= LARGE_VALUES:
@@ -118,15 +125,36 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def read_open(source: inputs.Source) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read an EXR file that is open, as `read` does."""
     path, header = source.path, header_of(source)
-    source.check_pixels(header.width, header.height)
+    top, left, bottom, right = header.stored
+    for width, height in ((header.width, header.height), (right - left, bottom - top)):
+        source.check_pixels(width, height)
     try:
         with source.reopened() as same, OpenEXR.File(same, separate_channels=True) as file:
-            channels = {name: channel.pixels for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
+            channels = {name: _displayed(channel.pixels, header)
+                        for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
     except (RuntimeError, ValueError) as error:
         raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
     if len(channels) < len(header.channels):  # the library leaves out a part that it cannot decode
         raise ImageError(f"{path}: cannot be decoded: its data is damaged")
     return channels, header.metadata
+
+
+def _window(corners: Sequence[Sequence[int]]) -> tuple[int, int, int, int]:
+    """Return the first row and column of a window, and those behind the last."""
+    (left, top), (right, bottom) = corners
+    return int(top), int(left), int(bottom) + 1, int(right) + 1
+
+
+def _displayed(pixels: np.ndarray, header: Header) -> np.ndarray:
+    """Return stored pixels in their place of the display window, and 0 around them."""
+    top, left, bottom, right = header.stored
+    if header.stored == (0, 0, header.height, header.width) or pixels.shape != (bottom - top, right - left):  # or a channel of fewer pixels
+        return pixels
+    shown = np.zeros((header.height, header.width), dtype=pixels.dtype)
+    rows, cols = slice(max(top, 0), max(bottom, 0)), slice(max(left, 0), max(right, 0))
+    part = pixels[max(-top, 0) :, max(-left, 0) :][: max(header.height - rows.start, 0), : max(header.width - cols.start, 0)]
+    shown[rows, cols] = part
+    return shown
 
 
 def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: str, metadata: Mapping[str, Any],

@@ -8,6 +8,7 @@ import numpy as np
 from stage.capture.capture import Capture
 from stage.capture.light import OffLight
 from stage.capture.manifest import ColorMatrix, Frame
+from stage.colour import radiance
 from stage.colour.colour import linearise
 from stage.colour.colour_spaces import channels_apart, is_linear
 from stage.errors import ImageError
@@ -15,6 +16,9 @@ from stage.formats import exr, images
 
 FULL_SCALE = 1.0
 """The largest integer as `images.read_pixels` gives it."""
+BRIGHTER_DARK, BRIGHTER_OFF = 0.25, 0.5
+"""Parts of the mask from which on a dark image, and `off` frames, are refused that are brighter there than an image: sensors have pixels
+that glow more in one image than in another, and light of a room flickers."""
 
 
 class Radiance(NamedTuple):
@@ -99,9 +103,28 @@ class Correction:
                 every = every.view(np.float16).astype(np.float32)
                 every[~np.isfinite(every)] = 0  # which no image has
             return CodedRadiance(codes, self.corrected(every, frame), saturated)
+        code = 1 / np.iinfo(recorded.dtype).max if recorded.dtype.kind == "u" else 0.0
         if recorded.dtype == np.float16:
             recorded = recorded.astype(np.float32)
-        return Radiance(self.corrected(recorded, frame), saturated)
+        pixels = self._subtracted(recorded, frame)
+        if self.dark is not None or self.ambient is not None:
+            pixels = self._checked(frame, pixels, code / (frame.exposure_s or 1.0))
+        return Radiance(self._in_colours(pixels, frame), saturated)
+
+    def _checked(self, frame: Frame, pixels: np.ndarray, code: float) -> np.ndarray:
+        """Return a frame of which dark or ambient light was taken off, by more than its noise and a code of integers at no more pixels than
+        glow or flicker; the values below noise are set to 0 where the capture asks for it."""
+        if self.capture.pixels.clip_negative:
+            pixels, count = radiance.clip_negative(pixels)
+            if count:
+                self.capture.clipped[frame.image] = max(count, self.capture.clipped.get(frame.image, 0))
+            return pixels
+        below = np.any(pixels < radiance.noise_floor(pixels) - code, axis=-1)[self.capture.mask()]
+        brighter, most = ("dark", BRIGHTER_DARK) if self.ambient is None else ("an `off` frame", BRIGHTER_OFF)
+        if below.mean() > most:
+            raise ImageError(f"{self.capture.file(frame.image)}: {brighter} is brighter at {int(below.sum())} of {below.size} pixels of "
+                             f"the mask, by {-float(pixels.min()):.2g} at most: check its exposure; {radiance.CLIP_NEGATIVE}")
+        return pixels
 
     def has_codes(self, frame: Frame) -> bool:
         """Return whether a frame has integers or half values of which each stands for one radiance, as its header tells."""
@@ -122,6 +145,10 @@ class Correction:
     def corrected(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
         """Return the scene-linear radiance of recorded values of a frame, [rows, cols, 3] float32 of the same size as the images here.
         `recorded`: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16."""
+        return self._in_colours(self._subtracted(recorded, frame), frame)
+
+    def _subtracted(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
+        """Return the same in the channels of the camera."""
         pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark
@@ -131,6 +158,9 @@ class Correction:
             pixels = pixels / np.float32(frame.exposure_s)
         if self.ambient is not None:
             pixels = pixels - self.ambient
+        return pixels
+
+    def _in_colours(self, pixels: np.ndarray, frame: Frame) -> np.ndarray:
         matrix = self._matrix(frame)
         return pixels if matrix is None else pixels @ np.array(matrix, np.float32).T
 

@@ -31,6 +31,7 @@ class EnvironmentSamples(NamedTuple):
     energy: np.ndarray  # [n, 3] float64 ∫ L dω of each box
     radius: np.ndarray  # [n] float64 radians: half the longer side of each box
     box: np.ndarray  # [n, 4] int: first and last row and column of the map, the last not included
+    solid_angle: np.ndarray  # [n] float64 steradians of each box
 
 
 class EnvironmentParts(NamedTuple):
@@ -98,8 +99,8 @@ def sample_environment(environment: np.ndarray, count: int = SAMPLES) -> Environ
     length = np.linalg.norm(direction, axis=1)
     kept = (energy.sum(axis=1) > 0) & (length > 0)
     radius = np.array([max(sides(box)) / 2 for _, box in boxes])
-    return EnvironmentSamples(direction[kept] / length[kept, None], energy[kept], radius[kept],
-                              np.array([box for _, box in boxes])[kept])
+    return EnvironmentSamples(direction[kept] / length[kept, None], energy[kept], radius[kept], np.array([box for _, box in boxes])[kept],
+                              total(np.broadcast_to(solid_angle[:, None], (rows, cols)))[kept])
 
 
 def split_environment(environment: np.ndarray, radius: float) -> EnvironmentParts:

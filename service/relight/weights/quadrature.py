@@ -5,6 +5,9 @@ of unknown mean and of Matérn covariance (1 + √3 r/ρ) exp(−√3 r/ρ) at d
 neighbouring lights. The weights have the least expected squared error of ∫ L I dω among those that are not negative and whose sum is
 ∫ L dω. So light from a captured direction gives that light's image, no energy is lost, and no frame is darker than 0 where no image is.
 
+A map is shared out in layers of brightness, each with weights that are not negative: the weights of a sun, some of them below 0, would
+be held at 0 together with those of the sky behind it, and take away its light.
+
 Light from beyond the captured lights (kernels.relight.model.beyond) is shared out by `share_smooth`, because a field that is unknown there
 would put it on the rim alone.
 
@@ -36,6 +39,11 @@ SAMPLES = 2048
 0.1 %, root mean square, of those of twenty times as many samples."""
 MIN_ROWS = 180
 """Least rows of samples that a map is cut from; texels of coarser maps are cut finer, because they stand for areas."""
+LAYER, MORE = 64.0, 1.5
+"""Radiance of the brightest over that of the dimmest light of a layer of a map, and energy over that of all dimmer light with which a layer
+is one of its own. The dark side of a matt ball keeps 89 % of the light of an even sky, or more, beside windows up to 300 times as bright
+(32 lights; 98 % with 96); in one layer 49 %, and nothing under a sun. Each layer leaves more of its light to neighbouring images: layers of
+16 double the error of three soft lamps, and a sun of the energy of the sky is 1.2 % off in place of 0.9 % (331 lights)."""
 CHUNK_VALUES = 1 << 15
 """Number of values of the kernel that are computed at one time: they stay in the cache."""
 ROUNDING = 1e-9
@@ -58,7 +66,22 @@ def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations:
     samples = sample_environment(environment if parts == 1 else environment.repeat(parts, axis=0).repeat(parts, axis=1), SAMPLES)
     offset = np.pi / len(environment) * ((np.arange(parts) + 0.5) / parts - 0.5)
     energy = samples.energy / np.cos(offset).mean()  # a texel's solid angle is that of its middle row (kernels.relight.directions.latlong)
-    return np.stack([share_kernel(samples.direction @ rotation.T, energy, directions) for rotation in rotations])
+    layers = (layer_parts(samples.energy.sum(axis=1), samples.solid_angle)[..., None] * energy[:, None]).reshape(len(energy), -1)
+    shared = np.stack([share_kernel(samples.direction @ rotation.T, layers, directions) for rotation in rotations])
+    return np.asarray(shared.reshape(len(rotations), len(directions), -1, 3).sum(axis=2))
+
+
+def layer_parts(energy: np.ndarray, solid_angle: np.ndarray) -> np.ndarray:
+    """Return [samples, layers] the parts of each sample in each layer of radiance; they sum to 1.
+    `energy`: [samples] of all channels, above 0; `solid_angle`: [samples] steradians. A layer ends LAYER times below the brightest
+    radiance, LAYER times below that and so on, where there is light on both sides, and has more than MORE times the energy of all that is
+    dimmer."""
+    radiance = energy / solid_angle
+    top = radiance.max(initial=0.0)
+    below = np.minimum(radiance[:, None], top / LAYER ** np.unique(np.floor(np.log(top / radiance) / np.log(LAYER)))[::-1])  # dimmest first
+    whole = solid_angle @ below
+    kept = np.append(np.diff(whole) > MORE * whole[:-1], True)
+    return np.diff(below[:, kept], axis=1, prepend=0.0) / radiance[:, None]
 
 
 def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -51,6 +51,24 @@ def test_a_header_without_a_colour_space_means_rec709():
     assert exr.color_space_of({}, "lin_ap1_scene") == "lin_ap1_scene"
 
 
+@pytest.mark.parametrize(("first", "count"), [
+    ((5, 3), (20, 8)), ((-4, -6), (37, 23)), ((-2, 4), (45, 30)), ((30, 20), (9, 7)), ((50, 50), (4, 4)), ((-9, -9), (5, 5))])
+@pytest.mark.parametrize("corner", [(0, 0), (100, -7)])
+def test_pixels_stand_where_the_display_window_has_them(tmp_path, first, count, corner):
+    """Files that store a part of the picture, as autocropped ones do, or more than it; a crop of an environment map was taken for all of
+    it. Truth: every stored pixel put in its place by itself."""
+    plane = np.random.default_rng(7).random(count).astype(np.float32)
+    windows = [(np.array([a[1], a[0]], np.int32), np.array([a[1] + n[1] - 1, a[0] + n[0] - 1], np.int32)) for a, n in (
+        ((first[0] + corner[0], first[1] + corner[1]), count), (corner, (37, 23)))]
+    OpenEXR.File({"dataWindow": windows[0], "displayWindow": windows[1]}, {"Y": plane}).write(str(tmp_path / "a.exr"))
+    truth = np.zeros((37, 23), np.float32)
+    for row, col in itertools.product(*map(range, count)):
+        if 0 <= row + first[0] < 37 and 0 <= col + first[1] < 23:
+            truth[row + first[0], col + first[1]] = plane[row, col]
+    header = exr.read_header(tmp_path / "a.exr")
+    assert (header.height, header.width) == (37, 23) and np.array_equal(exr.read(tmp_path / "a.exr")[0]["Y"], truth)
+
+
 def test_dwa_is_close_and_smaller(tmp_path):
     smooth = {"Y": np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(64, 64).astype(np.float16)}
     exr.write(tmp_path / "a.exr", smooth, color_space="lin_rec709_scene", metadata={}, compression=exr.Compression.DWAA)

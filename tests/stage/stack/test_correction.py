@@ -5,7 +5,7 @@ from math import isqrt
 import numpy as np
 import pytest
 
-from stage.capture.capture import Capture
+from stage.capture.capture import Capture, PixelChoices
 from stage.capture.lighting import distant_lights
 from stage.errors import ImageError
 from stage.stack.brackets import merge_brackets, one_frame_a_light
@@ -51,7 +51,8 @@ def test_dark_flat_exposure_and_ambient_together(tmp_path):
     write_exr(tmp_path / "flat.exr", FLAT)
     edit_manifest(tmp_path, dark="dark.exr", flat="flat.exr")
     exposures = [0.5, 0.25, 2.0, 4.0]
-    recorded = [(DARK + image * exposure).astype(np.float32) for image, exposure in zip(SCENE.images, exposures, strict=True)]
+    images = [image * (0.1 if index > 1 else 1.0) for index, image in enumerate(SCENE.images)]
+    recorded = [(DARK + image * exposure).astype(np.float32) for image, exposure in zip(images, exposures, strict=True)]
     for index, (image, exposure) in enumerate(zip(recorded, exposures, strict=True)):
         write_exr(tmp_path / f"{index:03d}.exr", image)
         edit_frame(tmp_path, index, exposure_s=exposure)
@@ -168,11 +169,43 @@ def test_display_encoded_frames_are_linearised_dark_and_all(tmp_path):
 
 
 def test_noise_below_dark_stays_negative(tmp_path):
-    write_capture(tmp_path, SCENE)
-    write_exr(tmp_path / "000.exr", np.zeros((8, 8, 3)))
-    write_exr(tmp_path / "dark.exr", DARK)
+    noise = 0.002 * np.random.default_rng(4).standard_normal((64, 64, 3)).astype(np.float32)
+    write_capture(tmp_path, make_scene(size=64, lights=4))
+    write_exr(tmp_path / "000.exr", 0.01 + noise)
+    write_exr(tmp_path / "dark.exr", np.full((64, 64, 3), 0.01, np.float32))
     edit_manifest(tmp_path, dark="dark.exr")
-    assert np.array_equal(corrected(tmp_path).pixels, -DARK)
+    assert np.allclose(corrected(tmp_path).pixels, noise, **ROUNDING)
+
+
+@pytest.mark.parametrize("kind", ["dark", "off", "dark, integers"])
+def test_dark_images_that_are_brighter_than_the_others_are_refused(tmp_path, kind):
+    """Readings of two thirds of an object were below zero, and pictures of it dark, without a word."""
+    write_capture(tmp_path, SCENE)
+    bright = SCENE.images[0] + 0.02
+    if kind == "off":
+        write_exr(tmp_path / "003.exr", bright)
+        edit_frame(tmp_path, 3, light={"type": "off"})
+    elif kind == "dark":
+        write_exr(tmp_path / "dark.exr", bright)
+        edit_manifest(tmp_path, dark="dark.exr")
+    else:
+        write_image(tmp_path / "000.png", np.rint(65535 * SCENE.images[0]).astype(np.uint16))
+        write_image(tmp_path / "dark.png", np.rint(65535 * bright).astype(np.uint16))
+        edit_frame(tmp_path, 0, image="000.png")
+        edit_manifest(tmp_path, dark="dark.png")
+    with pytest.raises(ImageError, match=r"000\.(exr|png): .*(dark|off).* is brighter at 52 of 52 pixels"):
+        corrected(tmp_path)
+    capture = Capture.open(tmp_path, PixelChoices(clip_negative=True))
+    assert Correction.of(capture).apply(capture.sources()[0]).pixels.min() == 0 and capture.clipped
+
+
+def test_a_dark_image_of_a_code_more_is_rounding(tmp_path):
+    write_capture(tmp_path, SCENE)
+    for name, code in (("000", 6), ("dark", 7)):
+        write_image(tmp_path / f"{name}.png", np.full((8, 8, 3), code, np.uint8))
+    edit_frame(tmp_path, 0, image="000.png")
+    edit_manifest(tmp_path, dark="dark.png")
+    assert np.allclose(corrected(tmp_path).pixels, -1 / 255, **ROUNDING)
 
 
 @pytest.mark.parametrize("name", ["dark.exr", "flat.exr", "000.exr"])

@@ -153,6 +153,7 @@ def prepare(folder):
     write_capture(folder, SCENE, dark="dark.exr", flat="flat.exr")
     for index in range(LIGHTS):
         edit_frame(folder, index, exposure_s=1.0)
+    write_exr(folder / "004.exr", np.full((9, 9, 3), 0.002))  # may be `off`
     write_exr(folder / "dark.exr", np.full((9, 9, 3), 0.001))
     write_exr(folder / "flat.exr", 1 + np.random.default_rng(2).random((9, 9, 3)))
 

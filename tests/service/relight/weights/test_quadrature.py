@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kernels.errors import ArrayError
 from kernels.relight.model.beyond import share_beyond
 from kernels.relight.weights.cells import integrate_cells
-from service.relight.weights.quadrature import integrate_kernel, share_kernel
+from service.relight.weights.quadrature import integrate_kernel, layer_parts, share_kernel
 from service.relight.weights.triangulation import share_smooth
 from service.relight.weights.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
@@ -105,14 +105,37 @@ def test_shading_is_integrated_more_exactly_than_by_cells_and_smooth(lights, par
         assert kernel < part * error(other(environment, directions, STILL, device="cpu").energy)
 
 
+@pytest.mark.parametrize("times", [0.0, 1.0, 8.0, 50.0, 500.0])
+def test_a_sun_takes_no_light_from_the_sky(times):
+    """Matt normals that face away from a sun of so many times the irradiance of an even sky: a sixth to a half of the light was left to
+    them at 50 times, none at 500. The bounds are those of 96 lights in place of all directions: 8 % of the sky, and what lights on both
+    sides of a shadow line let through, 1/1500 of the sun."""
+    directions, normals = cap(96, 180), scattered(400, 7)
+    environment = np.ones((90, 180, 3))
+    environment[30, 50] += times * np.pi / texel_solid_angles(90, 180)[30, 0]
+    away = normals[normals @ texel_directions(90, 180)[30, 50] < -0.3]
+    light = np.maximum(away @ directions.T, 0) @ integrate_kernel(environment, directions, STILL)[0] / np.pi
+    assert light.min() > 0.92 and light.max() < 1.08 + times / 1500
+
+
+def test_layers_end_where_there_is_light_on_both_sides():
+    radiance = np.array([6400.0, 3200.0, 80.0, 2.0])
+    parts = [[100 / 6400, 6300 / 6400], [100 / 3200, 3100 / 3200], [1, 0], [1, 0]]
+    np.testing.assert_allclose(layer_parts(radiance, np.ones(4)), parts, rtol=ROUNDING)
+    np.testing.assert_allclose(layer_parts(np.array([5.0, 4.0]), np.ones(2)), [[1], [1]], rtol=ROUNDING)
+    steradians = np.array([0.001, 0.001, 1.0, 1.0])  # the bright light has a tenth of the energy
+    np.testing.assert_allclose(layer_parts(steradians * radiance, steradians), np.ones((4, 1)), rtol=ROUNDING)
+
+
 @pytest.mark.parametrize("directions", [cap(128, 180), scattered(128, 4), DOME], ids=["even", "scattered", "dome"])
 @pytest.mark.parametrize("environment", [lobes(np.random.default_rng(7), 100, 200), np.ones((90, 180, 3)) + sun(90, 180, 30, 50, 5e3)])
 def test_a_map_is_cut_finely_enough(directions, environment):
-    """Truth: every texel by itself."""
+    """Truth: every texel by itself, in the same layers."""
     rotation = turn(3)
     rows = list(samples(environment, rotation, down=1, across=1))
     towards, solid_angle, radiance = (np.concatenate([row[k] for row in rows]) for k in range(3))
-    truth = share_kernel(towards, solid_angle[:, None] * radiance, directions)
+    layers = layer_parts(solid_angle * radiance.sum(axis=1), solid_angle).T[..., None] * solid_angle[:, None] * radiance
+    truth = sum(share_kernel(towards, layer, directions) for layer in layers)
     given = integrate_kernel(environment, directions, rotation[None])[0]
     np.testing.assert_allclose(given, truth, atol=SAMPLED * truth.sum(axis=0).max())
 
