@@ -81,7 +81,7 @@ def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilate
         found.append(f"the colours of the lamps miss up to {gamut:.0%} of the light: its colours lie outside theirs")
     if environments is not None and environments.clipped:
         found.append(f"{sum(environments.clipped.values())} pixels of environments were negative and are 0")
-    return found
+    return [*found, *(environments.doubts() if environments is not None else [])]
 
 
 def report_sections(light: Light, wanted: WantedLevels, dilated: Dilated, quantised: Quantised, judgement: Judgement, unrounded: Judgement,

@@ -20,7 +20,7 @@ BATCH = 256
 """The number of normals that are lit at one time: it bounds the memory."""
 XYZ = "lin_ciexyzd65_scene"
 DARK = 1e-3
-"""The chromaticity of normals that receive less than this part of the mean irradiance is not judged."""
+"""The chromaticity of normals that receive, or should, less than this part of the mean irradiance is not judged: no light has no colour."""
 
 
 class Judgement(NamedTuple):
@@ -54,7 +54,7 @@ def judge(
             whole += samples.energy.sum()
         wanted = wanted * factor
         given = irradiance_of(towards, lamp, turned)
-        lit = wanted.sum(axis=1) > DARK * max(wanted.sum(axis=1).mean(), np.finfo(float).tiny)
+        lit = np.all([each.sum(axis=1) > DARK * max(each.sum(axis=1).mean(), np.finfo(float).tiny) for each in (wanted, given)], axis=0)
         off = np.linalg.norm(_uv(given[lit] @ to_xyz.T) - _uv(wanted[lit] @ to_xyz.T), axis=1)
         scale = max(float(np.sqrt((wanted**2).mean())), np.finfo(float).tiny)
         found.append((np.sqrt(((given - wanted) ** 2).mean()) / scale, off.max(initial=0),

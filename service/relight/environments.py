@@ -19,6 +19,11 @@ SHARP_RADIUS_DEGREES = 2.0
 other samples is interpolated from the captured lights around them."""
 
 
+LEAST_OUTSIDE, FEW_ROWS = 0.01, 16
+"""Part of the light of a map, added by colours outside of the working space, from which on it is said; and number of rows below which it is
+said that texels count by their middle, which makes an even map of 16 rows 0.2 % brighter."""
+
+
 class EnvironmentMap:
     """An environment map in a working space."""
 
@@ -51,6 +56,9 @@ class Environments:
         self._sequence = "#" in str(pattern) and not pattern.is_file()
         self.clipped: dict[str, int] | None = {} if clip_negative else None
         """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
+        self.outside: dict[str, float] = {}
+        """The part of the light that colours outside of the working space gain, by the names of the maps that were read so far."""
+        self._rows: dict[str, int] = {}
         self._digests: dict[Path, str] = {}
         self._last: tuple[Path, str, EnvironmentMap] | None = None
         if self._sequence and (len(re.findall("#+", pattern.name)) != 1 or "#" in str(pattern.parent)):
@@ -70,8 +78,24 @@ class Environments:
     def read(self, path: Path, space: str) -> EnvironmentMap:
         """Return one environment map in a working space; the last one that was read is kept."""
         if self._last is None or self._last[:2] != (path, space):
-            self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped)))
+            self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped, outside=self.outside)))
+            self._rows[path.name] = len(self._last[2].radiance)
         return self._last[2]
+
+    def doubts(self) -> list[str]:
+        """Return a sentence for each thing that makes the light of the maps that were read so far another one than theirs."""
+        found = []
+        most = max(self.outside, key=lambda name: self.outside[name], default=None)
+        if most is not None and self.outside[most] >= LEAST_OUTSIDE:
+            found.append(f"environment {most}: has colours outside of the working space, of which channels below 0 are set to 0: that adds "
+                         f"{100 * self.outside[most]:.2g} % of its light; give images, or lamps, in a wider space, or a map without such "
+                         "colours")
+        fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
+        if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
+            half = np.pi / (2 * rows)
+            found.append(f"environment {fewest}: has {rows} rows, which count with the height of their middle: an even map is "
+                         f"{100 * (half / np.sin(half) - 1):.2g} % too bright; give {FEW_ROWS} rows or more")
+        return found
 
     def content(self, path: Path) -> str:
         """Return the content hash of an environment map."""

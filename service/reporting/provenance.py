@@ -12,6 +12,8 @@ from typing import Any
 from service import __version__
 from service.requests.base.base import Options, Role
 from service.requests.base.options import role_of
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
 from stage.colour.configuration import current
 from stage.errors import ResultError
 from stage.stack.ingest import LAYOUT
@@ -85,6 +87,13 @@ def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str 
         raise ResultError(f"{maps}: was solved from other images than the capture has, or with other alignment: solve it again")
     return (f"{maps}: was solved by another version of relit ({HASHING} {provenance.get(HASHING, 'is missing')}, here {LAYOUT}), which "
             "hashed images otherwise, so that nothing tells whether they are those of the capture: solve it again if in doubt")
+
+
+def other_camera(camera: Camera, capture: Capture, maps: Path) -> str | None:
+    """Return the sentence for maps with another camera than the capture has; None: they have the same."""
+    differs = [name for name, value in camera if value != getattr(capture.camera, name)]
+    return None if not differs else (f"{maps}: was solved with another camera.{', camera.'.join(differs)} than the manifest of the capture "
+                                     "has now: solve it again, or what is placed by the maps stands elsewhere than they say")
 
 
 def export_metadata(request: Options, contents: Mapping[str, str]) -> dict[str, str]:

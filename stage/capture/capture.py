@@ -17,6 +17,7 @@ from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, St
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.formats.exif import Exposure, check_agreement, exposure_times, unused_exposures
+from stage.formats.exr import PRIMARIES
 from stage.formats.images import ImageHeader
 from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
@@ -75,8 +76,9 @@ class Capture:
             if not (folder / FILE_NAME).exists():
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
-        capture = capture._exposed(capture._check_files())
-        capture = replace(capture, doubts=(*capture.doubts, *capture.manifest.assumed))
+        headers = capture._check_files()
+        capture = capture._exposed(headers)
+        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -218,6 +220,14 @@ class Capture:
             return replace(self, manifest=self.manifest.model_copy(update={"frames": frames, "exposure_from": None}))
         timed = any(frame.exposure_s is not None for frame in self.manifest.frames)
         return self if timed else replace(self, doubts=tuple(unused_exposures(exposures)))
+
+    def _other_spaces(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where images declare another scene-linear colour space than the manifest."""
+        space = self.manifest.color_space
+        others = [name for name, header in headers.items() if header.space not in ("", space)] if space in PRIMARIES else []
+        default = "" if "color_space" in self.manifest.model_fields_set else " by default"
+        return [f"color_space: {space} is declared{default}, and {headers[others[0]].space} by {len(others)} of the {len(headers)} images, "
+                f"{others[0]} the first of them: they are read as {space}; declare the space that they have"] if others else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""

@@ -12,6 +12,7 @@ from stage.formats import exr, images
 SUFFIXES = {".exr", ".hdr"}
 
 
+
 def check_environment(path: Path) -> None:
     """Check the header of an environment map. Raises ImageError if it is not EXR or HDR, or not twice as wide as high."""
     if path.suffix.lower() not in SUFFIXES:
@@ -21,12 +22,13 @@ def check_environment(path: Path) -> None:
         raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
 
 
-def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None) -> np.ndarray:
+def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None,
+                     outside: dict[str, float] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
     `path`: lat-long .exr or .hdr. `space`: the scene-linear colour space of the result. `clipped`: is given the number of pixels with
-    values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. Returns [rows, cols, 3]
-    float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is
-    0."""
+    values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. `outside`: is given the
+    part of its light that colours outside of the gamut of `space` gain, 0 or above. Returns [rows, cols, 3] float32, scene-linear, none of
+    them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is 0."""
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:
         check_radiance(path, pixels, remedy=CLIP_NEGATIVE)
@@ -39,4 +41,10 @@ def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None =
         converted = convert(pixels, given, space)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
-    return np.maximum(converted, 0)
+    shown = np.maximum(converted, 0)
+    if outside is not None and given != space:
+        height = np.sin(np.pi * (np.arange(len(shown)) + 0.5) / len(shown))
+        whole = float(np.einsum("rck,r->", shown, height))
+        outside[path.name] = float(np.einsum("rck,r->", shown - converted, height)) / whole if whole > 0 else 0.0
+    return shown
+

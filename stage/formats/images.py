@@ -35,6 +35,7 @@ class ImageHeader(NamedTuple):
     orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.formats.exif.TURNS`; they are read upright
     exposure: Exposure = Exposure()  # as EXIF says
     half: bool = False  # whether all colour channels hold half values
+    space: str = ""  # the scene-linear colour space that an EXR file declares; empty where it declares none that is known
 
 
 class Decoder(Protocol):
@@ -75,7 +76,12 @@ def header_of(source: inputs.Source) -> ImageHeader:
     if suffix == ".exr":
         header = exr.header_of(source)
         colours = _colour_channels(path, header.channels)
-        return ImageHeader(header.width, header.height, len(colours), len(header.channels), False, half=header.half.issuperset(colours))
+        try:
+            space = exr.color_space_of(header.metadata, "")
+        except ValueError:
+            space = ""
+        return ImageHeader(header.width, header.height, len(colours), len(header.channels), False, half=header.half.issuperset(colours),
+                           space=space if space in exr.PRIMARIES else "")
     _check_suffix(path)
     if suffix == ".png":
         integrity.check_png(path, source.file, contents=False)

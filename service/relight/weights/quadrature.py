@@ -76,8 +76,10 @@ def layer_parts(energy: np.ndarray, solid_angle: np.ndarray) -> np.ndarray:
     `energy`: [samples] of all channels, above 0; `solid_angle`: [samples] steradians. A layer ends LAYER times below the brightest
     radiance, LAYER times below that and so on, where there is light on both sides, and has more than MORE times the energy of all that is
     dimmer."""
+    if not len(energy):
+        return np.ones((0, 1))
     radiance = energy / solid_angle
-    top = radiance.max(initial=0.0)
+    top = radiance.max()
     below = np.minimum(radiance[:, None], top / LAYER ** np.unique(np.floor(np.log(top / radiance) / np.log(LAYER)))[::-1])  # dimmest first
     whole = solid_angle @ below
     kept = np.append(np.diff(whole) > MORE * whole[:-1], True)

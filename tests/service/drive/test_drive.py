@@ -81,6 +81,14 @@ def test_the_sphere_of_normals_receives_the_light_of_the_sky(drive, tmp_path, co
     assert rms(ours, truth) < rms(np.maximum(NORMALS @ directions.T, 0) @ best, truth) + 0.005
 
 
+def test_normals_that_no_lamp_lights_have_no_colour(drive, tmp_path):
+    """Lamps on one side, under a neutral sky: u'v' was said to be .51 off, that of nothing from that of white."""
+    write_rig(tmp_path / "rig.json", [way for way in fibonacci_sphere(200) if way[2] > 0.6], bits=16)
+    write_exr(tmp_path / "sky.exr", np.full((32, 64, 3), 0.01, np.float32))
+    _, report = drive("--environment", tmp_path / "sky.exr")
+    assert report["irradiance_error"]["chromaticity_uv"]["largest"] < 0.01
+
+
 def test_it_is_nearer_than_sampling_an_eight_bit_panorama_at_the_lamps(drive, tmp_path):
     directions = fibonacci_sphere(128)
     rig = write_rig(tmp_path / "rig.json", directions, irradiance=4.0, bits=8)

@@ -1,12 +1,15 @@
 """relit relight --maps: guided by a model, nearer to the truth than the plain sum, and never away from it."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 
 from service.relight.model_range import LitModel, correction
 from service.reporting.provenance import HASHING
 from stage.stack.ingest import LAYOUT
-from tests.scenes.captures import rgb, write_exr
+from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
 SURFACE = dome()
@@ -128,3 +131,14 @@ def test_maps_of_a_version_that_hashed_otherwise_guide_with_a_warning(relit, sce
         outcome = relit(*words, "--out", tmp_path / f"{name}.#.exr", "--maps", write_maps(tmp_path / name, SURFACE, provenance=provenance))
         assert outcome.code == 0 and (HASHING in outcome.out) == (name == "other")
     assert np.array_equal(rgb(tmp_path / "one.1.exr"), rgb(tmp_path / "other.1.exr"))
+
+
+def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
+    """A manifest that was corrected after the solve: what `P` and the cameras of frames say did not fit together."""
+    folder, _ = scene
+    words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--maps", folder / "maps")
+    assert "another camera" not in relit(*words, "--out", tmp_path / "a.#.exr").out
+    camera = json.loads((folder / "cap" / "capture.json").read_text())["camera"]
+    copy = shutil.copytree(folder / "cap", tmp_path / "cap")
+    edit_manifest(copy, camera={**camera, "pixel_size_m": 0.5})
+    assert "another camera.pixel_size_m than" in relit(words[0], copy, *words[2:], "--out", tmp_path / "b.#.exr").out

@@ -10,7 +10,7 @@ from stage.capture.camera import Camera, Distortion
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_solvable, distant_lights
 from stage.errors import ImageError, ManifestError, StorageError
-from tests.scenes.captures import edit_frame, make_scene, ring, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, ring, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=6, lights=4)
 
@@ -21,6 +21,18 @@ def refused(folder, error=ManifestError) -> str:
     text = str(caught.value)
     assert text.count(str(folder)) == 1 and "\n" not in text
     return text
+
+
+def test_another_colour_space_in_the_images_is_said(tmp_path):
+    """Frames of images in ACEScg were 13 % off under a manifest without a colour space."""
+    write_capture(tmp_path, SCENE)
+    assert Capture.open(tmp_path).doubts == ()
+    for index in (1, 3):
+        write_exr(tmp_path / f"{index:03d}.exr", SCENE.images[index], colorInteropID="lin_ap1_scene")
+    doubt, = Capture.open(tmp_path).doubts
+    assert "lin_ap1_scene by 2 of the 4 images, 001.exr the first" in doubt and "lin_rec709_scene" in doubt
+    edit_manifest(tmp_path, color_space="lin_ap1_scene")
+    assert Capture.open(tmp_path).doubts == ()
 
 
 def test_a_folder_or_its_manifest(tmp_path):

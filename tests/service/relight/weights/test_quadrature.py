@@ -123,6 +123,7 @@ def test_layers_end_where_there_is_light_on_both_sides():
     parts = [[100 / 6400, 6300 / 6400], [100 / 3200, 3100 / 3200], [1, 0], [1, 0]]
     np.testing.assert_allclose(layer_parts(radiance, np.ones(4)), parts, rtol=ROUNDING)
     np.testing.assert_allclose(layer_parts(np.array([5.0, 4.0]), np.ones(2)), [[1], [1]], rtol=ROUNDING)
+    assert layer_parts(np.ones(0), np.ones(0)).shape == (0, 1)  # of a black map
     steradians = np.array([0.001, 0.001, 1.0, 1.0])  # the bright light has a tenth of the energy
     np.testing.assert_allclose(layer_parts(steradians * radiance, steradians), np.ones((4, 1)), rtol=ROUNDING)
 
