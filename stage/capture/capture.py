@@ -224,7 +224,7 @@ class Capture:
     def _other_spaces(self, headers: Mapping[str, ImageHeader]) -> list[str]:
         """Return a sentence where images declare another scene-linear colour space than the manifest."""
         space = self.manifest.color_space
-        others = [name for name, header in headers.items() if header.space not in ("", space)] if space in PRIMARIES else []
+        others = sorted(name for name, header in headers.items() if header.space not in ("", space)) if space in PRIMARIES else []
         default = "" if "color_space" in self.manifest.model_fields_set else " by default"
         return [f"color_space: {space} is declared{default}, and {headers[others[0]].space} by {len(others)} of the {len(headers)} images, "
                 f"{others[0]} the first of them: they are read as {space}; declare the space that they have"] if others else []

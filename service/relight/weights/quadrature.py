@@ -66,7 +66,8 @@ def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations:
     samples = sample_environment(environment if parts == 1 else environment.repeat(parts, axis=0).repeat(parts, axis=1), SAMPLES)
     offset = np.pi / len(environment) * ((np.arange(parts) + 0.5) / parts - 0.5)
     energy = samples.energy / np.cos(offset).mean()  # a texel's solid angle is that of its middle row (kernels.relight.directions.latlong)
-    layers = (layer_parts(samples.energy.sum(axis=1), samples.solid_angle)[..., None] * energy[:, None]).reshape(len(energy), -1)
+    parts_of = layer_parts(samples.energy.sum(axis=1), samples.solid_angle)
+    layers = (parts_of[..., None] * energy[:, None]).reshape(len(energy), 3 * parts_of.shape[1])
     shared = np.stack([share_kernel(samples.direction @ rotation.T, layers, directions) for rotation in rotations])
     return np.asarray(shared.reshape(len(rotations), len(directions), -1, 3).sum(axis=2))
 
