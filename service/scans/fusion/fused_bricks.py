@@ -41,8 +41,8 @@ class FusedBricks(NamedTuple):
     names: tuple[str, ...]  # the layers of all scans
     voxel: float  # metres
     places: np.ndarray  # [n, 3] int64 of each brick, in bricks from the origin, in ascending order
-    shared_sigma: float
-    """Standard deviation, metres, of what each scan errs as a whole at a place; it is in the σ of the bricks."""
+    shared_sigma: float | None
+    """Standard deviation, metres, of what each scan errs as a whole at a place, which is in the σ of the bricks; None: it is not known."""
     brick: Callable[[int], BrickSurface]
     """Returns the surface of the brick of a number; its tallies are those of `used`."""
     scan: Callable[[int], PreparedScan]
@@ -122,10 +122,13 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
                         advance=timings.advance)
     shared = shared_sigma(samples, readings, used, float(np.median([summaries[number].pitch for number in used])))
+    if shared is None and len(used) > 1:
+        warnings.append("the scans have too little in common to tell what each errs as a whole, by its pose or its calibration: σ of the "
+                        "surface holds their noise alone")
 
     def brick(number: int) -> BrickSurface:
         found = unpacked_brick(content(f"{number:06d}"))
-        return found._replace(sigma=np.hypot(found.sigma, shared / np.sqrt(np.maximum(found.seen, 1))).astype(np.float32))
+        return found._replace(sigma=np.hypot(found.sigma, (shared or 0.0) / np.sqrt(np.maximum(found.seen, 1))).astype(np.float32))
 
     return FusedBricks(summaries, placings, used, names, voxel, places, shared, brick,
                        lambda place: scans.with_layers(used[place], names), warnings)
