@@ -93,6 +93,32 @@ def test_a_flat_wall_has_two_sides_unless_its_normals_tell():
     assert degrees_off(found.place, [wall, wall], np.array([0.0, 0.0, -1.0])).max() < 5
 
 
+def cap(*, hollow: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a third of a ball around the origin that is seen from above and their normals: of its top, or of a bowl, its bottom."""
+    normals = np.random.default_rng(5).normal(size=(8000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] > 0.4]
+    return (normals * [1, 1, -1], normals * [-1, -1, 1]) if hollow else (normals, normals.copy())
+
+
+@pytest.mark.parametrize("shift", [[0, 0, -3], [3, 0, 0]], ids=["frame of the scanner", "origin beside"])
+def test_flipped_normals_do_not_put_the_scanner_behind(shift):
+    points, normals = cap(hollow=False)
+    points = points + shift
+    found = find_viewpoints([points] * 3, [-normals] * 3)
+    assert found.place is None and "the normals look flipped" in found.reason
+    right = find_viewpoints([points] * 3, [normals] * 3)
+    assert right.place is not None and (right.place[:, 2] > points[:, 2].max() - 0.1).all()
+
+
+def test_normals_of_a_bowl_before_its_scanner_are_not_accused():
+    """Its rims turn towards the scanner, as those of a body do that is seen from behind, but the scanner is at the origin."""
+    points, normals = cap(hollow=True)
+    points = points - [0, 0, 3.0]
+    found = find_viewpoints([points] * 3, [normals] * 3)
+    assert found.place is not None and (found.place[:, 2] > points[:, 2].max()).all()
+
+
 def test_a_body_seen_from_all_around_is_no_scan():
     random = np.random.default_rng(4)
     ball = random.normal(size=(4000, 3))
