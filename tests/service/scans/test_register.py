@@ -185,6 +185,17 @@ def test_the_angles_of_a_turntable_are_refined(relit, tmp_path, given):
         assert turn < 0.1 and turn <= 4 * entry["pose_sigma_degrees"] + 1e-9
 
 
+@pytest.mark.long
+def test_a_wrong_axis_of_a_turntable_is_named(relit, tmp_path):
+    seen = views(figure, 0, 30, 60)
+    table = table_of(seen, 0, 30, 60)
+    table["turntable"]["axis_point_m"][0] += 20 * MM  # the loop then leaves a hundred times its noise
+    outcome = relit("register", write(tmp_path / "set", seen, top=table), "--out", tmp_path / "out", "--turntable", "angles")
+    assert "the axis of the turntable, lenses or σ may be wrong" in outcome.out + outcome.err
+    outcome = relit("register", tmp_path / "set", "--out", tmp_path / "free", "--turntable", "start")
+    assert "may be wrong" not in outcome.out + outcome.err
+
+
 def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
     seen = views(figure, 0, 30, 60)
     folder = write(tmp_path / "set", seen, top=table_of(seen, 0, 30, 60))
