@@ -94,7 +94,7 @@ def test_a_scan_that_is_there_twice_counts_once(relit, tmp_path):
     folder = write(tmp_path / "twice", (*seen[:2], seen[1], seen[2]))
     data = json.loads((folder / "scan-set.json").read_text())
     outcome = relit("register", folder, "--out", tmp_path / "found", "--reference", "s0")
-    assert outcome.code == 0 and "s2: is the same file as s1, byte by byte, and counts once" in outcome.out + outcome.err
+    assert outcome.code == 0 and "s2: holds the same points as s1, and counts once" in outcome.out + outcome.err
     assert "joined   3 of 3 scans" in outcome.out
     assert json.loads((tmp_path / "found" / "report.json").read_text())["duplicates"] == {"s2": "s1"}
     once, twice = (read_scan_set(tmp_path / name)[1].scans for name in ("out", "found"))
