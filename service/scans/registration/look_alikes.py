@@ -76,8 +76,8 @@ def told_from_turned(a: Prepared, b: Prepared, best: Pair, *, cell_m: float, lea
 def told_from_shifted(a: Prepared, b: Prepared, best: Pair, start: np.ndarray, *, cell_m: float, least_overlap: float, accept: bool
                       ) -> Pair:
     """Return a joined pair, refused if another pose about as near its start, a_from_b [4, 4], fits as well, as where a surface repeats.
-    `accept`: take the pair all the same, with a σ that reaches the other pose."""
-    if best.state is not PairState.JOINED or best.fit is None:
+    `accept`: take the pair all the same, with a σ that reaches the other pose, or as it is where its start was accepted already."""
+    if best.state is not PairState.JOINED or best.fit is None or (accept and best.reason):
         return best
     here, pivot, units = best.fit.pose, best.fit.pivot, step_units(b)
 
