@@ -102,7 +102,7 @@ def test_a_scan_that_is_there_twice_counts_once(relit, tmp_path):
     for here, there in ((0, 0), (1, 1), (1, 2), (2, 3)):
         assert once[here].scan_to_world == twice[there].scan_to_world and once[here].pose_covariance == twice[there].pose_covariance
     refused = relit.refused("register", write(tmp_path / "one", (seen[0], seen[0])), "--out", tmp_path / "none")
-    assert "holds one scan" in refused and "s1: is the same file as s0" in refused
+    assert "holds one scan" in refused and "s1: holds the same points as s0" in refused
 
 
 def test_poses_of_the_file_are_starts(relit, tmp_path):
