@@ -1,16 +1,26 @@
-"""Scans that are in a set twice, byte by byte: they tell nothing that the first one has not told, and would make it look surer.
+"""Scans that are in a set twice, byte by byte or as point sets that were written anew in another format, unit or order: they tell nothing
+that the first one has not told, and would make it look surer.
 
-A scan of the same file that is said to stand elsewhere, or to have other targets, another σ or maps, is another scan.
+A scan of the same points that is said to stand elsewhere, or to have other targets, another σ or maps, is another scan.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from scipy.spatial import KDTree
+
+from service.scans.points.ply_points import read_ply_points, vertices_of
 from stage.errors import storage
 from stage.results.depth_maps import DEPTH_FILE
-from stage.sets.scan_set import ScanSet
+from stage.sets.scan_set import UNITS_M, ScanEntry, ScanSet
 from stage.stack.fingerprint import digest
+
+COMPARED = 1000
+"""About how many points of a set must be points of the other, beside the bounds of both."""
+ROUNDING = 1e-5
+"""Distance, in the largest coordinate, up to which two points are one that was rounded: six digits are kept. Noise is larger."""
 
 
 class Distinct(NamedTuple):
@@ -22,7 +32,7 @@ class Distinct(NamedTuple):
 
     def warnings(self) -> list[str]:
         """Return a sentence for each duplicate."""
-        return [f"scan {name}: is the same file as {first}, byte by byte, and counts once" for name, first in self.same_as.items()]
+        return [f"scan {name}: holds the same points as {first}, and counts once" for name, first in self.same_as.items()]
 
 
 def distinct(file: Path, listed: ScanSet) -> Distinct:
@@ -35,6 +45,7 @@ def distinct(file: Path, listed: ScanSet) -> Distinct:
             name = first.setdefault((digest(_measured(file, entry.path)), entry.model_dump_json(exclude={"name", "path"})), entry.name)
             if name != entry.name:
                 same_as[entry.name] = name
+    same_as |= _written_anew(file, [entry for entry in listed.scans if entry.name not in same_as])
     if not same_as:
         return Distinct(listed, {})
     kept = [number for number, entry in enumerate(listed.scans) if entry.name not in same_as]
@@ -52,6 +63,27 @@ def _alike(file: Path, listed: ScanSet) -> Iterator[list[int]]:
             if (path := _measured(file, entry.path)).is_file():
                 by_size.setdefault(path.stat().st_size, []).append(number)
     return (numbers for numbers in by_size.values() if len(numbers) > 1)
+
+
+def _written_anew(file: Path, entries: Sequence[ScanEntry]) -> dict[str, str]:
+    """Return which point sets have the points of an earlier one, by their names."""
+    alike: dict[tuple[int, str], list[ScanEntry]] = {}
+    for entry in entries:
+        if (path := file.parent / entry.path).suffix.lower() == ".ply" and path.is_file():
+            alike.setdefault((vertices_of(path), entry.model_dump_json(exclude={"name", "path", "unit"})), []).append(entry)
+    same_as: dict[str, str] = {}
+    for several in alike.values():
+        firsts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for entry in several if len(several) > 1 else ():
+            points = read_ply_points(file.parent / entry.path).points * UNITS_M[entry.unit]
+            bounds, rounding = np.stack([points.min(axis=0), points.max(axis=0)]), ROUNDING * np.abs(points).max()
+            first = next((name for name, (some, around) in firsts.items() if np.abs(around - bounds).max() <= rounding
+                          and KDTree(points).query(some)[0].max() <= rounding), None)
+            if first is None:
+                firsts[entry.name] = points[::max(len(points) // COMPARED, 1)], bounds
+            else:
+                same_as[entry.name] = first
+    return same_as
 
 
 def _measured(file: Path, path: str) -> Path:

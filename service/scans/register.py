@@ -172,7 +172,7 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
     except NoneJoinedError as error:
         return _Placed(known, {}, {}, error.alone, error.pairs, {"method": PAIRS}, said, error)
     return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, registration_facts(found, known),
-                   said + registration_warnings(found, known))
+                   said + registration_warnings(found, known, axis_held=request.turntable is TableUse.ANGLES))
 
 
 def _without_viewpoint(listed: ScanSet, known: list[ScanFacts]) -> list[str]:

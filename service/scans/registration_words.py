@@ -36,8 +36,8 @@ def registration_facts(found: Registration, scans: Sequence[ScanFacts]) -> dict[
             **target_facts(found.targets, scans)}
 
 
-def registration_warnings(found: Registration, scans: Sequence[ScanFacts]) -> list[str]:
-    """Return what the user should know of a registration by pairs."""
+def registration_warnings(found: Registration, scans: Sequence[ScanFacts], *, axis_held: bool) -> list[str]:
+    """Return what the user should know of a registration by pairs; `axis_held`: only the angles of a turntable were to be found."""
     out = [f"{scans[number].name}: has no pose: {words}" for number, words in found.alone.items()]
     for number, scale in found.scales.items():
         out.append(f"{scans[number].name}: is about {abs(scale - 1):.1%} {'larger' if scale > 1 else 'smaller'} than the others: "
@@ -58,8 +58,9 @@ def registration_warnings(found: Registration, scans: Sequence[ScanFacts]) -> li
                    "targets, starts or a turntable")
     out += _target_warnings(found, scans)
     if np.isfinite(found.factor) and found.factor > LOOSE:
-        out.append(f"loops leave {found.factor:.3g} times what the noise of the pairs explains: lenses or σ may be wrong; the "
-                   "covariances are multiplied by its square")
+        out.append(f"loops leave {found.factor:.3g} times what the noise of the pairs explains: "
+                   f"{'the axis of the turntable, ' if axis_held else ''}lenses or σ may be wrong; the covariances are multiplied by its "
+                   "square")
     surfaces = [pair.fit.ratio for pair, _ in found.kept if pair.fit is not None and pair.by is Evidence.SURFACES]
     if surfaces and (worst := float(np.median(surfaces))) > SYSTEMATIC:
         out.append(f"the surfaces of pairs lie {worst:.3g} times as far apart as σ explains (median): σ is too small, or their points "

@@ -2,8 +2,9 @@
 
 A scan from one place hides nothing of itself: along the lines of sight each point is the nearest. So the direction to a scanner is one
 along which hardly any point lies behind another. From behind the same holds nearly as well, so that the side is told otherwise: by the
-normals of the file, or by the rims of the surface, at which a body turns away from who looks. Scans of one device stand mostly in its own
-frame, and are judged together.
+normals of the file, or by the rims of the surface, at which a body turns away from who looks. Where these two contradict each other the
+normals are flipped or the surface is hollow, as a bowl is, and nothing is told, unless the origin decides for the normals. Scans of one
+device stand mostly in its own frame, and are judged together.
 
 Source: the hull test of hidden points is Katz, Tal and Basri, "Direct visibility of point sets", SIGGRAPH 2007; here points are compared
     in cells across the direction, for the scanner is taken to be far away.
@@ -47,6 +48,8 @@ class Viewpoints(NamedTuple):
     """How far directions that explain the scans as well lie apart; 0 for the origin."""
     reason: str
     """How it was found, or why it was not, in words."""
+    contradicted: bool = False
+    """Whether it was not found because normals and rims tell opposite sides."""
 
 
 def find_viewpoints(scans: Sequence[np.ndarray], normals: Sequence[np.ndarray | None]) -> Viewpoints:
@@ -59,7 +62,8 @@ def find_viewpoints(scans: Sequence[np.ndarray], normals: Sequence[np.ndarray | 
     far = _far_away(few, [None if each is None else each[chosen] for each, chosen in zip(normals, drawn, strict=True)])
     towards_origin = -np.array([points.mean(axis=0) for points in few])
     # from within half a shell, too, little is hidden: there a place far away explains the scan, on the other side
-    if (far.place is None or ((far.place + towards_origin) * towards_origin).sum() > 0) and all(map(_seen_from_origin, few)):
+    if not far.contradicted and (far.place is None or ((far.place + towards_origin) * towards_origin).sum() > 0) and all(
+            map(_seen_from_origin, few)):
         return Viewpoints(np.zeros((len(scans), 3)), 0.0, "seen from the origin of its file, no scan hides much of itself")
     return far
 
@@ -79,15 +83,22 @@ def _far_away(scans: Sequence[np.ndarray], normals: Sequence[np.ndarray | None])
     directions, spread = np.array([direction for direction, _ in found]), max(spread for _, spread in found)
     least = together.min() if one else hidden.min(axis=1).max()
     how = f"along {'one direction' if one else 'a direction for each'}, seen from far away, {least:.1%} of the points hide behind others"
+    sides = {}
     for name, evidence in (("normals of the files", _by_normals(directions, normals)), ("rims of the surfaces", np.array(
             [_rims(points, np.tile(towards, (len(points), 1))) for points, towards in zip(scans, directions, strict=True)]))):
         if evidence is None:
             continue
         middle, error = float(evidence.mean()), float(evidence.std() / np.sqrt(max(len(evidence) - 1, 1)))
         if abs(middle) > max(SURE * error, LEAST) if one else (np.abs(evidence) > LEAST).all():
-            side = np.sign(middle if one else evidence[:, None])
-            return Viewpoints(middles + far * directions * side, spread, f"{how}; the {name} tell the side")
-    return Viewpoints(None, spread, f"{how}, from behind as from before, and nothing tells the side")
+            sides[name] = np.sign(np.full_like(evidence, middle) if one else evidence)[:, None]
+    if not sides:
+        return Viewpoints(None, spread, f"{how}, from behind as from before, and nothing tells the side")
+    name, side = next(iter(sides.items()))
+    faces_origin = all(((directions * side) * -middles).sum(axis=1) > 0) and all(map(_open_to_origin, scans))
+    if any((other != side).any() for other in sides.values()) and not faces_origin:
+        return Viewpoints(None, spread, "the normals of the files tell one side and the rims of the surfaces the other: the normals look "
+                                        "flipped, or the surface is hollow as a bowl is", contradicted=True)
+    return Viewpoints(middles + far * directions * side, spread, f"{how}; the {name} tell the side")
 
 
 def _middle(tried: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, float]:
@@ -119,6 +130,11 @@ def _hidden(points: np.ndarray, tried: np.ndarray) -> np.ndarray:
 
 def _seen_from_origin(points: np.ndarray) -> bool:
     """Return whether points [n, 3] can be a scan from the origin: few lie behind others, and the rims turn away from it."""
+    return _open_to_origin(points) and _rims(points, -points / np.linalg.norm(points, axis=1)[:, None]) > LEAST
+
+
+def _open_to_origin(points: np.ndarray) -> bool:
+    """Return whether few of points [n, 3] lie behind others, seen from the origin."""
     reach = np.linalg.norm(points, axis=1)
     if not reach.min() > 0:
         return False
@@ -126,7 +142,7 @@ def _seen_from_origin(points: np.ndarray) -> bool:
     distance, index = cKDTree(ray).query(ray, k=min(NEIGHBOURS + 1, len(points)))
     step = float(np.median(distance[:, min(4, distance.shape[1] - 1)]))
     behind = (distance < SAME_RAY * step) & (reach[:, None] - reach[index] > BEHIND * step * reach[:, None])
-    return bool(behind.any(axis=1).mean() <= MOST_HIDDEN) and _rims(points, -ray) > LEAST
+    return bool(behind.any(axis=1).mean() <= MOST_HIDDEN)
 
 
 def _by_normals(directions: np.ndarray, normals: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -179,7 +179,7 @@ def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]
         "voxel_m": fused.voxel,
         "bricks": surface.bricks, "blocks": surface.blocks, "brick_memory_bound_bytes": MEMORY_BOUND,
         "vertices": len(surface.points), "faces": len(surface.faces),
-        "shared_sigma_m": short(fused.shared_sigma),
+        "shared_sigma_m": None if fused.shared_sigma is None else short(fused.shared_sigma),
         "sigma_m": {"median": short(np.median(surface.sigma)), "p95": short(np.percentile(surface.sigma, 95))},
         "area_m2": short(holes.area_m2),
         "area_share_seen_by": {str(count): round(float(area[least >= count].sum() / holes.area_m2), 4) for count in SEEN_BY},

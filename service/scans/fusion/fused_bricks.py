@@ -19,6 +19,7 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
+from service.scans.fusion.common_scale import LEAST_SCANS, common_scale
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
@@ -40,8 +41,8 @@ class FusedBricks(NamedTuple):
     names: tuple[str, ...]  # the layers of all scans
     voxel: float  # metres
     places: np.ndarray  # [n, 3] int64 of each brick, in bricks from the origin, in ascending order
-    shared_sigma: float
-    """Standard deviation, metres, of what each scan errs as a whole at a place; it is in the σ of the bricks."""
+    shared_sigma: float | None
+    """Standard deviation, metres, of what each scan errs as a whole at a place, which is in the σ of the bricks; None: it is not known."""
     brick: Callable[[int], BrickSurface]
     """Returns the surface of the brick of a number; its tallies are those of `used`."""
     scan: Callable[[int], PreparedScan]
@@ -91,11 +92,17 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     readings = [Readings(**unpacked(content(piece))) for piece in numbers]
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
     warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
+    if (scale := _scale_that_fits(summaries, placings, readings, voxel)) is not None:
+        words = (f"several scans lie beside the others, and all fit if their coordinates are multiplied by {scale:.4f}, or the "
+                 f"translations of their poses by {1 / scale:.4f}: the unit or the calibration of one of the two is wrong")
+        if request.misplaced is Misplaced.LEAVE_OUT:
+            raise RequestError(f"{file}: {words}; --misplaced keep fuses them as they are")
+        warnings = [words]
     used = [number for number, placing in enumerate(placings) if not (placing.misplaced and request.misplaced is Misplaced.LEAVE_OUT)]
     if len(scans) > 1 and request.misplaced is Misplaced.LEAVE_OUT and all(placing.compared < LEAST_COMMON for placing in placings):
         raise RequestError(f"{file}: scans[].scan_to_world: no two of the {len(scans)} scans have a surface in common: look whether the "
                            "poses are world_to_scan, and that lengths are in metres; --misplaced keep fuses scans of several things")
-    if 2 * len(used) < len(scans) + (len(scans) == 2) or not used:
+    if 2 * len(used) < len(scans) + any(placing.against for placing in placings) or not used:
         raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
 
     timings.stage("bricks", len(used))
@@ -115,13 +122,26 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
                         advance=timings.advance)
     shared = shared_sigma(samples, readings, used, float(np.median([summaries[number].pitch for number in used])))
+    if shared is None and len(used) > 1:
+        warnings.append("the scans have too little in common to tell what each errs as a whole, by its pose or its calibration: σ of the "
+                        "surface holds their noise alone")
 
     def brick(number: int) -> BrickSurface:
         found = unpacked_brick(content(f"{number:06d}"))
-        return found._replace(sigma=np.hypot(found.sigma, shared / np.sqrt(np.maximum(found.seen, 1))).astype(np.float32))
+        return found._replace(sigma=np.hypot(found.sigma, (shared or 0.0) / np.sqrt(np.maximum(found.seen, 1))).astype(np.float32))
 
     return FusedBricks(summaries, placings, used, names, voxel, places, shared, brick,
                        lambda place: scans.with_layers(used[place], names), warnings)
+
+
+def _scale_that_fits(summaries: list[ScanSummary], placings: list[Placing], readings: list[Readings], voxel: float) -> float | None:
+    """Return the factor of all depths at which no scan is misplaced, where several are; None: there is none."""
+    if len(summaries) < LEAST_SCANS or sum(placing.misplaced for placing in placings) < 2:
+        return None
+    samples = [summary.sample for summary in summaries]
+    scanners = np.array([np.linalg.inv(summary.camera_from_world)[:3, 3] for summary in summaries])
+    scale, fitting = common_scale(samples, readings, scanners)
+    return None if any(placing.misplaced for placing in place_scans(samples, fitting, voxel)) else scale
 
 
 def _voxel(summaries: list[ScanSummary]) -> float:
@@ -132,13 +152,17 @@ def _voxel(summaries: list[ScanSummary]) -> float:
 
 def placing_warnings(names: list[str], placings: list[Placing], choice: Misplaced) -> Iterator[str]:
     """Yield which scans lie beside the others, by what becomes of these, and which have nothing in common with any."""
+    end = "was left out" if choice is Misplaced.LEAVE_OUT else "was fused all the same, and the surface is doubled there"
     for name, placing in zip(names, placings, strict=True):
+        others = " and ".join(names[other] for other in placing.against)
         if placing.misplaced:
-            end = "it was left out" if choice is Misplaced.LEAVE_OUT else "it was fused all the same, and the surface is doubled there"
-            yield (f"scan {name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of the others, whose noise explains "
-                   f"{1e3 * placing.sigma_m:.2g} mm: its pose is wrong, and {end}")
+            yield (f"scan {name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of {others or 'the others'}, whose noise "
+                   f"explains {1e3 * placing.sigma_m:.2g} mm: " + (
+                       f"one of their poses is wrong, no other scan tells which, and each {end}" if others else
+                       f"its pose is wrong, and it {end}"))
         elif placing.compared < LEAST_COMMON and len(names) > 1:
-            yield f"scan {name}: has next to no surface in common with the others, so that nothing tells whether its pose is right"
+            rest = "those that remain" if any(each.misplaced for each in placings) else "the others"
+            yield f"scan {name}: has next to no surface in common with {rest}, so that nothing tells whether its pose is right"
 
 
 def packed_brick(surface: BrickSurface) -> bytes:

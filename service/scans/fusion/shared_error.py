@@ -12,16 +12,16 @@ from service.scans.fusion.misplaced import Readings, Sample
 PIXELS_APART = 4.0
 """The distance, in pixels, from which on two places share no pixel of either scan."""
 NEIGHBOURS = 16
-"""Places among which one is looked for that is far enough."""
+"""Places among which one is first looked for that is far enough; twice as many where none is, until there are no more."""
 OTHER_SURFACE = 4.0
 """The distance between two scans, in its robust spread, from which on they show different surfaces."""
 LEAST_PAIRS = 200
 """Fewest pairs of places that tell; the mean of so few products is right to a tenth."""
 
 
-def shared_sigma(samples: list[Sample], readings: list[Readings], used: list[int], pixel_m: float) -> float:
-    """Return the standard deviation, metres, of what each scan errs as a whole at a place, over the `used` scans; 0 where they have too
-    little in common to tell.
+def shared_sigma(samples: list[Sample], readings: list[Readings], used: list[int], pixel_m: float) -> float | None:
+    """Return the standard deviation, metres, of what each scan errs as a whole at a place, over the `used` scans; None where they have
+    too little in common to tell.
     `readings`: of each scan, as `misplaced.readings_of` returns them. `pixel_m`: distance between neighbouring pixels on the surface."""
     firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
     partner = np.full(firsts[-1], -1)
@@ -37,11 +37,19 @@ def shared_sigma(samples: list[Sample], readings: list[Readings], used: list[int
         products = distance[partner >= 0] * distance[partner[partner >= 0]]
         known = np.isfinite(products)
         total, count = total + float(products[known].sum()), count + int(known.sum())
-    return float(np.sqrt(max(total / count, 0.0) / 2)) if count >= LEAST_PAIRS else 0.0
+    return float(np.sqrt(max(total / count, 0.0) / 2)) if count >= LEAST_PAIRS else None
 
 
 def _partners(points: np.ndarray, apart_m: float, first: int) -> np.ndarray:
     """Return the nearest other point of each that is at least so far away, [n], counted from `first`; −1 where there is none."""
-    distance, at = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))
-    far = distance >= apart_m
-    return np.where(far.any(axis=1), first + at[np.arange(len(at)), far.argmax(axis=1)], -1)
+    tree, count = KDTree(points), min(NEIGHBOURS, len(points))
+    found, left = np.full(len(points), -1), np.arange(len(points))
+    while True:
+        distance, at = tree.query(points[left], k=[*range(1, count + 1)])
+        far = distance >= apart_m
+        known = far.any(axis=1)
+        found[left[known]] = first + at[known, far[known].argmax(axis=1)]
+        left = left[~known]
+        if len(left) == 0 or count == len(points):
+            return found
+        count = min(2 * count, len(points))

@@ -73,8 +73,8 @@ def write_tiles(fused: FusedBricks, out: Path, *, name: str, provenance: dict[st
         write_mesh_ply(mesh, out / TILES / f"{stem}.ply", comments=(f"made by relit fuse from {name}", "coordinates in metres"))
         tiles.append(write_tile(mesh, out / TILES / f"{stem}.usdc"))
     count, length = _border(open_edges)
-    facts = {"voxel_m": fused.voxel, "shared_sigma_m": short(fused.shared_sigma), "bricks": len(fused.places), "tiles": len(tiles),
-             "blocks": blocks,
+    facts = {"voxel_m": fused.voxel, "shared_sigma_m": None if fused.shared_sigma is None else short(fused.shared_sigma),
+             "bricks": len(fused.places), "tiles": len(tiles), "blocks": blocks,
              "brick_memory_bound_bytes": MEMORY_BOUND, "vertices": vertices - shared, "faces": faces}
     if not tiles:
         return WrittenTiles(out / SITE_FILE, facts, tallies)

@@ -70,6 +70,12 @@ def read_ply_points(path: Path) -> PlyPoints:
                      None if confidence is None else confidence[:, 0].astype(np.float32), there)
 
 
+def vertices_of(path: Path) -> int:
+    """Return the number of vertices that the header of a PLY file names."""
+    with storage("read", path), open(path, "rb") as stream:
+        return _header(stream, path)[1][-1].entries
+
+
 def read_ply_faces(path: Path, kept: np.ndarray) -> np.ndarray | None:
     """Return the faces of a PLY file whose vertices they follow, [F, 3] int64 numbers of the `kept` [N] vertices, or None if it has none;
     faces with a vertex that was not kept are left out. Raises ResultError: it has faces that are no triangles, or of vertices that are not

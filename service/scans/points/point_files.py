@@ -1,6 +1,7 @@
 """Reading of scans from the point files of other programs: XYZ and ASC, PTS and PTX, PCD, LAS and LAZ, E57."""
 
 import io
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -20,6 +21,8 @@ UNIT_LENGTH = 0.02
 PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8", ("I", 1): "i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
              ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8"}
 MOST_HEADER = 4096
+DECIMAL_COMMAS = re.compile(rb"NUMBER(?:[\s;]+NUMBER){2,}".replace(b"NUMBER", rb"[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?"))
+"""A row of numbers some of which have decimal commas."""
 
 
 class PointScan(NamedTuple):
@@ -44,8 +47,17 @@ def read_point_scans(path: Path) -> list[PointScan]:
 
 def _columns(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
     """Yield the scan of rows of x, y, z, and of intensity, red, green and blue, or nx, ny and nz, where there are any."""
-    lines = (line.replace(b",", b" ").replace(b";", b" ") for line in stream)
-    yield _scan(_table((line for line in lines if line[:1] not in (b"#", b"/")), None, path))
+    yield _scan(_table(_with_points(line for line in stream if line[:1] not in (b"#", b"/")), None, path))
+
+
+def _with_points(lines: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield rows of numbers with decimal points and blanks between them. Their commas are decimal ones if in the first row that has any
+    each stands between digits and blanks or semicolons part three numbers or more."""
+    decimal = None
+    for line in lines:
+        if decimal is None and b"," in line:
+            decimal = DECIMAL_COMMAS.fullmatch(line.strip()) is not None
+        yield line.replace(b",", b"." if decimal else b" ").replace(b";", b" ")
 
 
 def _pts(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:

@@ -8,7 +8,7 @@ import numpy as np
 from service.scans.points.cloud import Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, inverse
 from service.scans.registration.coarse import fpfh
-from service.scans.registration.look_alikes import told_from_turned
+from service.scans.registration.look_alikes import told_from_shifted, told_from_turned
 from service.scans.registration.pairs import (
     FEATURE_CELLS,
     FINE_POINTS,
@@ -46,6 +46,8 @@ class PairTask(NamedTuple):
     """True if a pose that was searched is taken although the scans fit as well when they are turned."""
     start_decides: bool = False
     """True if the start is taken in directions that the surfaces leave open, and nothing is searched in its place."""
+    start_is_rough: bool = False
+    """True if the start is right to about a cell alone, so that other poses as near it are tried."""
 
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:
@@ -64,6 +66,8 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
             return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
         pair = refine(a, b, task.start, numbers=numbers, cell_m=cell, least_overlap=least_overlap,
                       decides=task.start_decides)
+        if task.start_is_rough:
+            pair = told_from_shifted(a, b, pair, task.start, cell_m=cell, least_overlap=least_overlap, accept=task.start_decides)
         if not task.may_search or task.start_decides or pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
             return pair
     return told_from_turned(a, b, search(a, b, numbers=numbers, cell_m=cell, least_overlap=least_overlap), cell_m=cell,

@@ -195,7 +195,7 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     best = found[0]
     if best.state is not PairState.JOINED:
         return best
-    rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
+    rival = next((pair for pair in found[1:] if as_good(pair, best)), None)
     if rival is not None:
         return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
     return _tried_out(a, b, best, cell_m, least_overlap, start, decides)
@@ -314,10 +314,11 @@ def _stays_away(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, shift: f
         if kept <= min(KEPT, RETURNED / abs(shift)):
             return False
     assert found is not None
-    return _as_good(judged(a, b, found, (best.a, best.b), least_overlap), best)
+    return as_good(judged(a, b, found, (best.a, best.b), least_overlap), best)
 
 
-def _as_good(pair: Pair, best: Pair) -> bool:
+def as_good(pair: Pair, best: Pair) -> bool:
+    """Return whether another pose of a pair fits as well as its best one."""
     assert pair.fit is not None and best.fit is not None
     return (pair.state is PairState.JOINED and pair.fit.ratio <= AS_GOOD * best.fit.ratio and pair.overlap >= LEAST_ALIKE * best.overlap
             and pair.contradicted <= best.contradicted + MORE_CONTRADICTED)

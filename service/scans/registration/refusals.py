@@ -3,14 +3,19 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from service.scans.points.scan import Target
+from service.scans.registration.pair_tasks import NOT_THERE
 from service.scans.registration.pairs import Pair, PairState
 
 
 def refusal(number: int, names: Sequence[str], pairs: Iterable[Pair], may_decide: bool) -> str:
     """Return why a scan could not be joined, by the pair that came nearest to it; `may_decide`: it has a start, which does not."""
-    tried = [pair for pair in pairs if number in (pair.a, pair.b) and pair.state is not PairState.NO_POSE]
+    own = [pair for pair in pairs if number in (pair.a, pair.b)]
+    tried = [pair for pair in own if pair.state is not PairState.NO_POSE]
+    if own and all(pair.reason == NOT_THERE for pair in own):
+        return "does not overlap the others at the poses that are given"
     if not tried:
-        return "has no surface in common with the others"
+        return ("no surface was found that it has in common with the others: it shows another part, too little of the same, or a pattern "
+                "that repeats, or its noise is too large")
     ambiguous = [pair for pair in tried if pair.state is PairState.AMBIGUOUS]
     joined = [pair for pair in tried if pair.state is PairState.JOINED]
     best = max(ambiguous or joined or tried, key=lambda pair: pair.overlap)

@@ -248,7 +248,7 @@ def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | Non
                 tasks.append(PairTask(a, b, None, 0.0, True, options.accept_alike))
         elif (a, b) in near:
             tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS, options.accept_alike,
-                                  options.starts_decide))
+                                  options.starts_decide, start_is_rough=True))
         elif count <= ALL_PAIRS:
             pairs[a, b] = Pair(a, b, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
     pairs |= registered(tasks, 0.15, 0.75)

@@ -228,6 +228,9 @@ def pcd(points: np.ndarray, data: str, viewpoint: str) -> bytes:
 
 @pytest.mark.parametrize(("name", "content", "coloured"), [
     ("a.xyz", "# a comment\n" + rows(CORNER), False), ("a.asc", rows(CORNER, COLOURS).replace(" ", ","), True),
+    ("a.xyz", "#x, y, z\n" + rows(CORNER).replace(".", ","), False),
+    ("a.asc", rows(CORNER, COLOURS).replace(".", ",").replace(" ", "; "), True),
+    ("a.xyz", rows(CORNER).replace(" ", ", "), False),
     ("a.xyz", rows(CORNER, np.full(5, 7), COLOURS), True), ("a.pts", "5\n" + rows(CORNER, np.full(5, -900), COLOURS), True),
     ("a.pcd", pcd(CORNER, "ascii", "0 0 0"), True), ("a.pcd", pcd(CORNER, "binary", "0 0 0"), True)])
 def test_points_of_other_programs_become_scans(relit, tmp_path, name, content, coloured):

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from service.requests.register import FuseRequest, Misplaced
+from service.scans.fusion.fuse import fuse
 from service.scans.fusion.misplaced import Readings, Sample
 from service.scans.fusion.shared_error import shared_sigma
+from tests.scenes.statue import turntable, write_scans
 
 PIXEL_M, SIGMA_M = 1e-3, 2e-4
 
@@ -44,5 +47,21 @@ def test_noise_does_not_count_and_what_a_place_has_in_common_does(shared_m, stat
 def test_scans_with_too_little_in_common_tell_nothing():
     samples, readings = planes(np.random.default_rng(1), 6e-4, 1.0)
     few = [Readings(each.at[:40], each.distance[:40], each.expected[:40]) for each in readings]
-    assert shared_sigma(samples, few, [0, 1, 2, 3], PIXEL_M) == 0
-    assert shared_sigma(samples, readings, [2], PIXEL_M) == 0
+    assert shared_sigma(samples, few, [0, 1, 2, 3], PIXEL_M) is None
+    assert shared_sigma(samples, readings, [2], PIXEL_M) is None
+
+
+def test_points_as_dense_as_pixels_tell_too():
+    """Of small scans all pixels are compared: here 40 points lie within four pixels of each, and none of them counts."""
+    samples, readings = planes(np.random.default_rng(2), 6e-4, 1.0)
+    found = shared_sigma(samples, readings, [0, 1, 2, 3], 2e-2)
+    # of waves of 200 mm and more a quarter of the variance is alike at 80 mm, so that half of the error shows; eight waves vary
+    assert found == pytest.approx(3e-4, rel=0.5)
+
+
+def test_what_is_not_known_is_null_and_said(tmp_path):
+    """Two sides of a statue that are opposite have nothing in common."""
+    result = fuse(FuseRequest(scan_set=write_scans(tmp_path, turntable(2, (48, 64), range_m=2.0)), out=tmp_path / "out", texture=False,
+                              misplaced=Misplaced.KEEP, device="cpu"))
+    assert result.facts["shared_sigma_m"] is None
+    assert any("too little in common to tell what each errs as a whole" in warning for warning in result.warnings)
