@@ -32,9 +32,9 @@ class Joined(NamedTuple):
     height: np.ndarray  # [rows, cols] float32 camera-frame z, 0 where there is no normal
     sigma: np.ndarray  # [rows, cols] float32 standard error of the height; 0 where it has no place
     normal: np.ndarray  # [3, rows, cols] float32, corrected; 0 where there was none
-    part: np.ndarray  # [rows, cols] int, pixels of one number are connected across no break; -1: no normal there
+    part: np.ndarray  # [rows, cols] int, pixels of one number are connected across no break; -1: no normal there, or a step on every side
     placed: np.ndarray  # [rows, cols] bool, where depth tells the height
-    rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, or contradict those around them
+    rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, lie alone, or contradict those around them
     guessed: np.ndarray  # [rows, cols] bool, beside a step without a depth of its own: which side it belongs to is a guess
     unexplained: float | None
     """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
@@ -81,8 +81,9 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     base = plane.to_heights(to_numpy(found.height).astype(np.float64), solved)
     part = np.where(solved, part, -1)
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
-    placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
-    known, unlike, left, shared = both & cuts.depth, 0.0, 0.0, 0.0
+    known = both & cuts.depth & (part >= 0)  # a pixel with a step on every side is of no part
+    placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~known
+    unlike, left, shared = 0.0, 0.0, 0.0
     largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
     relief = compare_relief(u, u_sigma, base, known & (part == largest), part)
     base = base * relief.factor

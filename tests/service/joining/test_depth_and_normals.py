@@ -162,6 +162,20 @@ def test_mixtures_at_an_outline_are_left_out(device):
     assert len(np.unique(joined.part[joined.placed])) == 2
 
 
+@pytest.mark.parametrize(("count", "perspective"), [(0, True), (1, True), (1, False), (40, True)])
+def test_single_depths_that_are_far_off_are_rejected(device, count, perspective):
+    view = see("wave", size=SIZE, perspective=perspective)
+    random = np.random.default_rng(1)
+    depth = -view.z + SIGMA * random.standard_normal(view.z.shape)
+    wrong = np.zeros(depth.shape, dtype=bool)
+    wrong.reshape(-1)[random.choice(depth.size, count, replace=False)] = True
+    depth[wrong] += 20 * MM
+    joined, _ = join(view, noise=NOISE, drift=2, sigma=SIGMA, device=device, depth=depth)
+    assert joined.rejected[wrong].all() and (joined.rejected & ~wrong).mean() < 0.01  # beside one, two in line look like mixtures
+    sure = joined.placed & ~joined.rejected & ~joined.guessed
+    assert np.sqrt(np.mean((joined.height - view.z)[sure] ** 2)) < LEAST_RATIO * SIGMA
+
+
 def test_what_normals_leave_unexplained_tells_a_mirrored_view(device):
     view = see("wave")
     right, _ = join(view, noise=0.5, drift=2, sigma=0.2 * MM, device=device)
