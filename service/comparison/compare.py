@@ -29,7 +29,6 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.neighbours import neighbours_are_installed
-from stage.errors import ScanError
 from stage.files import replacing, write_text
 from stage.formats.ply import COLOUR, NORMAL, POSITION, header
 from stage.sets.scan_set import UNITS_M
@@ -163,9 +162,6 @@ def _spacing(points: np.ndarray) -> float:
     """Return the median distance of a point to its fourth neighbour, which on a square grid is one step."""
     from scipy.spatial import cKDTree
 
-    points = np.unique(points, axis=0)  # files of triangles have corners more than once
-    if len(points) <= NEIGHBOUR:
-        raise ScanError(f"the scan has {len(points)} different points: too few to compare")
     chosen = points[np.random.default_rng(0).permutation(len(points))[:SPACING_POINTS]]
     return float(np.median(cKDTree(points).query(chosen, k=NEIGHBOUR + 1)[0][:, NEIGHBOUR]))
 
