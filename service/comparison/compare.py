@@ -125,7 +125,8 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
         request, inputs={"scan": _input(request.scan), "design": _input(request.design)}, device=devices.describe(device),
         timings_s=timings.close(), placement=_placement_facts(placement, size), deviations=_facts(found, sigma, len(scan.points), span),
         sigma_source=scan.sigma_source, reach_m=reach, smallest_fault_m=2 * patch, patches=len(patches.deviation),
-        decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts], warnings=warnings))
+        patch_shared_error_m=patches.shared_m, decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts],
+        warnings=warnings))
     return CompareResult(deviations_path, picture_path, report_path, regions_path, float(np.median(found.distance)),
                          float(np.sqrt(np.mean(found.distance**2))), float(np.median(sigma)), placement.sigma_m, 2 * patch,
                          tuple(verdicts), tuple(warnings))
