@@ -130,6 +130,18 @@ def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
         assert any("1.0030" in words and "times as large" in words for words in result.warnings)
 
 
+@pytest.mark.parametrize(("sides", "radius", "factor"), [
+    (256, 15.0, 1.003), pytest.param(256, 15.0, 0.998, marks=pytest.mark.long),
+    (256, 15.1, 1.0), pytest.param(24, 15.0, 1.0, marks=pytest.mark.long)])
+def test_what_is_larger_across_and_not_along_is_no_size_of_the_whole(tmp_path, sides, radius, factor):
+    """A bar that is too thick and exactly as long, and a design with flats in place of the round, are no error of the scanner."""
+    seen = scan_of(cylinder(256, radius), np.random.default_rng(6), 6000)
+    scan = write_scan(tmp_path / "scan.ply", seen._replace(points=factor * seen.points))
+    placement = reported(compare(request(tmp_path, scan, write_stl(tmp_path / "bar.stl", cylinder(sides)), align="refine")))["placement"]
+    assert placement.get("size_factor", 1.0) == pytest.approx(factor, abs=1.5e-4)
+    assert ("size_factor" in placement) == (factor != 1)
+
+
 @pytest.mark.long
 def test_what_the_surface_leaves_open_is_said(tmp_path):
     random = np.random.default_rng(1)
