@@ -43,6 +43,8 @@ class Joined(NamedTuple):
     relief: Relief
     shared_m: float
     """Standard deviation of errors that neighbouring depths share."""
+    one_sided_m: float
+    """By how much wrong depths that are too near to be rejected pull the surface to one side; 0 where it is not sure that they do."""
 
 
 def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
@@ -83,7 +85,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
     known = both & cuts.depth & (part >= 0)  # a pixel with a step on every side is of no part
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~known
-    unlike, left, shared = 0.0, 0.0, 0.0
+    unlike, left, shared, one_sided = 0.0, 0.0, 0.0, 0.0
     largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
     relief = compare_relief(u, u_sigma, base, known & (part == largest), part)
     base = base * relief.factor
@@ -94,7 +96,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         fixed = correct(u[box] - base[box], u_sigma[box], seen, here, slope_error=float(np.median(own_error[box][here])))
         for target, values in ((correction, fixed.value), (variance, fixed.variance)):
             target[box][here] = values[here]
-        shared = max(shared, fixed.shared)
+        shared, one_sided = max(shared, fixed.shared), max(one_sided, fixed.one_sided)
         placed[box][here] = True
         rejected[box][fixed.rejected] = True
         used = seen & ~fixed.rejected
@@ -112,7 +114,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
-                  float(plane.to_depth_sigmas(np.array(mean_z), np.array(shared))))
+                  *(float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided)))
 
 
 def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
