@@ -49,7 +49,7 @@ def shared_error(
     error = np.sqrt(QUANTILE * (1 - QUANTILE) / told.sum()) / density / expected
 
     def beyond(shared: float) -> float:
-        whole = variance + shared**2
+        whole = np.maximum(variance + shared**2, np.finfo(np.float64).tiny)  # a mesh without any noise has none
         around = MEDIAN * (others * whole[beside]).sum(axis=1) / count**2
         return float(np.quantile(left / np.sqrt(whole[told] + around), QUANTILE)) / expected - 1
 

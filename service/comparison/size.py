@@ -66,5 +66,5 @@ def _robust(design: np.ndarray, deviation: np.ndarray) -> tuple[np.ndarray, np.n
     told = powers > NOT_TOLD * powers[-1]
     inverse = (axes[:, told] / powers[told]) @ axes[:, told].T
     scores = inverse @ (scaled * (weight * left)[:, None]).T
-    open_ended = (axes[:, ~told] ** 2).sum(axis=1) > NOT_TOLD
-    return left, values, np.where(open_ended, np.inf, np.sqrt((scores**2).sum(axis=1)) / lengths)
+    unknown = (axes[:, ~told] ** 2).sum(axis=1) > NOT_TOLD
+    return left, values, np.where(unknown, np.inf, np.sqrt((scores**2).sum(axis=1)) / lengths)

@@ -52,6 +52,11 @@ def test_white_noise_and_faults_keep_the_σ_of_points(tmp_path, design, dent_m):
     assert dent_m or (found.deviation / found.sigma).std() == pytest.approx(1, abs=0.1)  # of 900 patches
 
 
+def test_a_mesh_without_any_noise_shares_no_error(tmp_path, design):
+    found = patches(design, write_stl(tmp_path / "scan.stl", machined_part()._replace(points=1e-3 * machined_part().points)))
+    assert np.abs(found.deviation).max() < 1e-8 and found.sigma.max() < 1e-3  # float32 of a mesh of 80 mm
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_readings_that_points_share_are_in_the_σ_of_patches(tmp_path, design, seed):
     scan = write_scan(tmp_path / "scan.ply", shared_scan(seed), np.sqrt(2) * SIGMA_M)
