@@ -29,7 +29,6 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.neighbours import neighbours_are_installed
-from stage.errors import ScanError
 from stage.files import replacing, write_text
 from stage.formats.ply import COLOUR, NORMAL, POSITION, header
 from stage.sets.scan_set import UNITS_M
@@ -126,7 +125,8 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
         request, inputs={"scan": _input(request.scan), "design": _input(request.design)}, device=devices.describe(device),
         timings_s=timings.close(), placement=_placement_facts(placement, size), deviations=_facts(found, sigma, len(scan.points), span),
         sigma_source=scan.sigma_source, reach_m=reach, smallest_fault_m=2 * patch, patches=len(patches.deviation),
-        decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts], warnings=warnings))
+        patch_shared_error_m=patches.shared_m, decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts],
+        warnings=warnings))
     return CompareResult(deviations_path, picture_path, report_path, regions_path, float(np.median(found.distance)),
                          float(np.sqrt(np.mean(found.distance**2))), float(np.median(sigma)), placement.sigma_m, 2 * patch,
                          tuple(verdicts), tuple(warnings))
@@ -163,9 +163,6 @@ def _spacing(points: np.ndarray) -> float:
     """Return the median distance of a point to its fourth neighbour, which on a square grid is one step."""
     from scipy.spatial import cKDTree
 
-    points = np.unique(points, axis=0)  # files of triangles have corners more than once
-    if len(points) <= NEIGHBOUR:
-        raise ScanError(f"the scan has {len(points)} different points: too few to compare")
     chosen = points[np.random.default_rng(0).permutation(len(points))[:SPACING_POINTS]]
     return float(np.median(cKDTree(points).query(chosen, k=NEIGHBOUR + 1)[0][:, NEIGHBOUR]))
 

@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
+from service.comparison.patch_errors import shared_error
 from service.comparison.placing import ALIKE, Placement, gradient
 from service.comparison.surfaces import Design, Offsets, ScannedSurface
 from service.scans.points.rigid import applied
@@ -60,6 +61,8 @@ class Patches(NamedTuple):
     deviation: np.ndarray  # [p] metres
     sigma: np.ndarray  # [p] metres
     points: np.ndarray  # [p] number of points
+    shared_m: float
+    """Standard deviation of errors that the points of a patch share, which σ holds."""
 
 
 def deviations_of(design: Design, scan: ScannedSurface, placement: Placement, reach_m: float) -> Deviations:
@@ -128,11 +131,13 @@ def patches_of(found: Deviations, design: Design, placement: Placement, *, patch
     scatter = np.maximum(mean(found.distance**2)[:, 0] - deviation**2, 0) * count[kept] / (count[kept] - 1)
     noise = mean(found.noise**2)[:, 0]
     unlike = scatter > noise * chdtri(count[kept] - 1, BY_CHANCE) / (count[kept] - 1)  # stray points, or a fault in a part of the patch
-    noise = np.where(unlike, scatter, noise) / count[kept]
-    pose = np.einsum("pi,ij,pj->p", moves, placement.covariance, moves)
-    across = mean(normal)
+    noise = np.where(unlike, scatter, noise)
+    middle, across = mean(found.at), mean(normal)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-    return Patches(mean(found.at), across, deviation, np.sqrt(noise + pose + shared_m**2), count[kept])
+    together = shared_error(deviation, noise / count[kept], middle, across, patch_m)
+    noise = noise / count[kept] + np.minimum(together**2, noise) * (1 - 1 / count[kept])  # a mean errs by no more than its points
+    pose = np.einsum("pi,ij,pj->p", moves, placement.covariance, moves)
+    return Patches(middle, across, deviation, np.sqrt(noise + pose + shared_m**2), count[kept], together)
 
 
 class RegionVerdict(NamedTuple):

@@ -8,10 +8,10 @@ import numpy as np
 from kernels.surface.nearest import NearestOnMesh
 from service.scans.fusion.fuse import MESH_FILE
 from service.scans.points.planes import local_planes, robust_scatter
-from service.scans.points.ply_points import read_ply_faces, read_ply_points
+from service.scans.points.ply_points import PlyPoints, read_ply_faces, read_ply_points
 from service.scans.viewpoints import find_viewpoints
 from stage.errors import ResultError
-from stage.formats.triangles import Triangles, read_triangles, without_empty_faces
+from stage.formats.triangles import Triangles, read_triangles, weld, without_empty_faces
 
 PLY = ".ply"
 ON_SURFACE = 1e-6
@@ -63,7 +63,7 @@ class Design:
         self.areas: np.ndarray = length / 2
         self.size: float = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         self._corners, self._search = corners, NearestOnMesh(self.points, self.faces, device=device)
-        welded = np.unique(self.points, axis=0, return_inverse=True)[1].reshape(-1)[self.faces]
+        welded = weld(self.points)[1][self.faces]
         start, end = welded[:, [1, 2, 0]], welded[:, [2, 0, 1]]  # the edges across from each corner
         ahead, back = start * np.int64(len(self.points)) + end, end * np.int64(len(self.points)) + start
         self._border: np.ndarray = ~np.isin(ahead, back)
@@ -128,12 +128,13 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
     file = path / MESH_FILE if path.is_dir() else path
     if file.suffix.lower() == PLY:
         ply = read_ply_points(file)
-        points, normals, sigma, faces = ply.points * unit_m, ply.normals, ply.sigma, read_ply_faces(file, ply.kept)
+        points, normals, sigma, faces = _once(ply, read_ply_faces(file, ply.kept))
+        points = points * unit_m
     else:
         points, faces = read_triangles(file)
         points, normals, sigma = points * unit_m, None, None
     if len(points) < LEAST_SCAN:
-        raise ResultError(f"{file}: has {len(points)} points: {LEAST_SCAN} are the fewest that are compared")
+        raise ResultError(f"{file}: has {len(points)} different points: {LEAST_SCAN} are the fewest that are compared")
     if normals is None:
         normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
     normals = np.nan_to_num(normals, posinf=0, neginf=0)
@@ -151,6 +152,20 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
             raise ResultError(f"{file}: its {len(points)} points are too few or too far apart to tell their σ: give --sigma-m")
         spread = np.full(len(points), scatter)
     return ScannedSurface(points, outward, spread, source, faces)
+
+
+def _once(ply: PlyPoints, faces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    """Return the points of a file, each place once, with the sums of their normals, their largest σ, and faces [f, 3] between them.
+    Vertices at one place are one reading, as where each triangle has corners of its own."""
+    kept, place = weld(ply.points)
+    normals = sigma = None
+    if ply.normals is not None:
+        normals = np.zeros((len(kept), 3))
+        np.add.at(normals, place, ply.normals)
+    if ply.sigma is not None:
+        sigma = ply.sigma[kept]
+        np.fmax.at(sigma, place, ply.sigma)
+    return ply.points[kept], normals, sigma, None if faces is None else place[faces]
 
 
 def _estimated_normals(points: np.ndarray, file: Path) -> np.ndarray:

@@ -21,6 +21,8 @@ PASSES = 2
 """Number of times each scale is looked at: cells are interpolated, which leaves part of a correction undone."""
 REJECTED = 5.0
 """Difference from its surroundings, in robust standard deviations, beyond which a reading is left out."""
+PULLED = 5.0
+"""Standard errors of the distance between the mean and the median of Gaussian values beyond which the values are of no symmetric noise."""
 SURROUNDINGS = 3
 """Scale of these surroundings, cells of 2^3 pixels."""
 DRIFT = np.radians(15.0)
@@ -36,6 +38,8 @@ class Correction(NamedTuple):
     rejected: np.ndarray  # [rows, cols] bool, readings that disagree with their surroundings
     shared: float
     """Standard deviation of errors that neighbours of the noisy map share, beyond any drift of the smooth one."""
+    one_sided: float
+    """By how much the errors of the noisy map pull to one side; 0 where it is not sure that they do."""
 
 
 def correct(
@@ -48,7 +52,8 @@ def correct(
     """Estimate the error of a smooth map from its difference to a noisy one.
 
     What the cells of a scale differ by beyond the noise and beyond what drift makes over so many pixels is an error that neighbours of the
-    noisy map share, and counts as its noise there.
+    noisy map share, and counts as its noise there. Means follow readings that are off to one side and too near to be rejected, which the
+    median of what is left tells: the variance holds that.
     """
     rejected = _outliers(difference, sigma, known)
     weight = np.where(known & ~rejected, 1 / sigma**2, 0)
@@ -75,7 +80,15 @@ def correct(
             if error == 0:
                 break
             value += _spread(error * told / (error * told + 1) * left, cover, level)
-    return Correction(value, variance, rejected, float(np.sqrt(shared)))
+    used = known & ~rejected
+    one_sided = _one_sided(((difference - value) / sigma)[used]) * float(np.median(sigma[used]))
+    return Correction(value, variance + one_sided**2, rejected, float(np.sqrt(shared)), one_sided)
+
+
+def _one_sided(left: np.ndarray) -> float:
+    """Return the distance of the mean of what is left from its median, in standard deviations, where noise does not explain it; else 0."""
+    found = abs(float(left.mean() - np.median(left)))
+    return found if found > PULLED * float(left.std()) * np.sqrt((np.pi / 2 - 1) / len(left)) else 0.0
 
 
 def _outliers(difference: np.ndarray, sigma: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -32,9 +32,9 @@ class Joined(NamedTuple):
     height: np.ndarray  # [rows, cols] float32 camera-frame z, 0 where there is no normal
     sigma: np.ndarray  # [rows, cols] float32 standard error of the height; 0 where it has no place
     normal: np.ndarray  # [3, rows, cols] float32, corrected; 0 where there was none
-    part: np.ndarray  # [rows, cols] int, pixels of one number are connected across no break; -1: no normal there
+    part: np.ndarray  # [rows, cols] int, pixels of one number are connected across no break; -1: no normal there, or a step on every side
     placed: np.ndarray  # [rows, cols] bool, where depth tells the height
-    rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, or contradict those around them
+    rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, lie alone, or contradict those around them
     guessed: np.ndarray  # [rows, cols] bool, beside a step without a depth of its own: which side it belongs to is a guess
     unexplained: float | None
     """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
@@ -43,6 +43,8 @@ class Joined(NamedTuple):
     relief: Relief
     shared_m: float
     """Standard deviation of errors that neighbouring depths share."""
+    one_sided_m: float
+    """By how much wrong depths that are too near to be rejected pull the surface to one side; 0 where it is not sure that they do."""
 
 
 def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
@@ -81,8 +83,9 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     base = plane.to_heights(to_numpy(found.height).astype(np.float64), solved)
     part = np.where(solved, part, -1)
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
-    placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
-    known, unlike, left, shared = both & cuts.depth, 0.0, 0.0, 0.0
+    known = both & cuts.depth & (part >= 0)  # a pixel with a step on every side is of no part
+    placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~known
+    unlike, left, shared, one_sided = 0.0, 0.0, 0.0, 0.0
     largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
     relief = compare_relief(u, u_sigma, base, known & (part == largest), part)
     base = base * relief.factor
@@ -93,7 +96,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         fixed = correct(u[box] - base[box], u_sigma[box], seen, here, slope_error=float(np.median(own_error[box][here])))
         for target, values in ((correction, fixed.value), (variance, fixed.variance)):
             target[box][here] = values[here]
-        shared = max(shared, fixed.shared)
+        shared, one_sided = max(shared, fixed.shared), max(one_sided, fixed.one_sided)
         placed[box][here] = True
         rejected[box][fixed.rejected] = True
         used = seen & ~fixed.rejected
@@ -111,7 +114,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
-                  float(plane.to_depth_sigmas(np.array(mean_z), np.array(shared))))
+                  *(float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided)))
 
 
 def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:

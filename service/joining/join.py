@@ -126,6 +126,7 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "normals_turned_degrees": {"median": _median(turned), "p95": round(float(np.percentile(turned, 95)), 4) if turned.size else 0.0},
         "parts": int(joined.part.max()) + 1,
         "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
+        "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
         "normals_factor": round(joined.relief.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.relief.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
     }
@@ -142,6 +143,9 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
     if facts["depth_shared_error_m"] > SHARED * facts["sigma_m"]["depth_median"]:
         found.append(f"depth: neighbours share errors of {facts['depth_shared_error_m']:.2g} m that no drift of normals makes, as after "
                      "smoothing, by ripple or from another place of the camera: height_sigma holds them")
+    if facts["depth_one_sided_m"] > SHARED * facts["sigma_m"]["depth_median"]:
+        found.append(f"depth: its errors pull the surface to one side by some {facts['depth_one_sided_m']:.2g} m, as where many depths are "
+                     "off alike and too near to be left out: height_sigma holds that")
     if facts["normals_factor"] != 1:
         found.append(f"normals: the relief of the depth is {facts['normals_factor']:.3g} times theirs, which are "
                      f"{'flat' if facts['normals_factor'] > 1 else 'steep'}: the joined ones have that of the depth")

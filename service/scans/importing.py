@@ -37,6 +37,8 @@ MIXED = 100.0
 FOR_POINTS = {"unit": "--unit", "viewpoint_m": "--viewpoint", "poses": "--poses"}
 FOR_FRAMES = {"poses": "--poses", "intrinsics_px": "--intrinsics", "every": "--every", "depth_unit_m": "--depth-unit-m"}
 """The options that point files, and the frames of a depth camera, take beside those of a turntable; results of relit depth take none."""
+COARSE = 1e-4
+"""Steps between the numbers of a file, in sizes of the scan, that are said: finer ones are below the noise of scanners."""
 GREY = 128
 """The colour of points without one, of 255."""
 
@@ -83,6 +85,9 @@ def import_scans(request: ScansImport) -> Imported:
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
+    if folder == source and moved is not None:
+        raise ManifestError(f"{source}: its points lie far from the origin, and are counted from among them: give another folder for the "
+                            "scans")
     _angles(request, len(scans))
     for scan in scans:
         if scan.converted is not None:
@@ -98,12 +103,12 @@ def import_scans(request: ScansImport) -> Imported:
     facts += _doubts(request, scans, sizes, any(name.lower().endswith(METRIC) for name in names))
     places = _viewpoints(request, scans, facts)
     entries = [ScanEntry.model_validate({
-        "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.path in names else "m",
+        "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.converted is None else "m",
         **({} if place is None else {"viewpoint_m": place}),
         **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})})
         for scan, place in zip(scans, places, strict=True)]
     if folder != source:
-        place_images(source, folder, [name for name in names if name not in converted and any(scan.path == name for scan in scans)])
+        place_images(source, folder, [scan.path for scan in scans if scan.converted is None])
     return _written(request, entries, facts)
 
 
@@ -152,24 +157,35 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
     """Return the scans, of which those of other files than PLY are to be written, and the place in the files that becomes the origin, or
     None.
 
-    Coordinates on a map are too large for the floats of a PLY file.
+    Coordinates on a map are too large for floats of 32 bits: a PLY file with doubles is written anew.
     """
     unit, moved, stems = UNITS_M[request.unit.value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
     found = []
+
+    def shift_of(points: np.ndarray, pose: np.ndarray | None) -> np.ndarray:
+        nonlocal moved
+        if moved is None and pose is None and np.abs(points).max() > FAR_AWAY * np.ptp(points, axis=0).max():
+            moved = np.rint(points.mean(axis=0))
+        return np.zeros(3) if moved is None or pose is not None else moved
+
     for name in names:
         stem = Path(name).stem
         if name.lower().endswith(".ply"):
             cloud = read_ply_points(request.source / name)
             pose = None if name not in poses else _in_metres(poses[name], unit)
             _check_points(request.source / name, cloud.points)
-            found.append(_Scan(stem, name, cloud.points * unit, cloud.normals, None, pose))
+            doubles = bool((cloud.points != cloud.points.astype(np.float32)).any())
+            shift = shift_of(cloud.points, pose) if doubles else np.zeros(3)
+            points = (cloud.points - shift) * unit
+            converted = None if not shift.any() else PointCloud(
+                points.astype(np.float32), _grey(points) if cloud.colours is None else cloud.colours, cloud.normals,
+                sigma=None if cloud.sigma is None else cloud.sigma * unit, confidence=cloud.confidence)
+            found.append(_Scan(stem, name, points, cloud.normals, None, pose, converted))
             continue
         parts = read_point_scans(request.source / name)
         for number, part in enumerate(parts, start=1):
             _check_points(request.source / name, part.points)
-            if moved is None and part.pose is None and np.abs(part.points).max() > FAR_AWAY * np.ptp(part.points, axis=0).max():
-                moved = np.rint(part.points.mean(axis=0))
-            shift = np.zeros(3) if moved is None or part.pose is not None else moved
+            shift = shift_of(part.points, part.pose)
             points = (part.points - shift) * unit
             unique = stem if len(parts) == 1 else f"{stem}-{number}"
             while unique in stems:
@@ -177,10 +193,14 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
             stems.add(unique)
             pose = None if part.pose is None else _in_metres(part.pose, unit)
             place = None if part.viewpoint is None else (part.viewpoint - shift) * unit
-            grey = np.full(points.shape, GREY, np.uint8) if part.colours is None else part.colours
-            converted = PointCloud(points.astype(np.float32), grey, part.normals)
+            colours = _grey(points) if part.colours is None else part.colours
+            converted = PointCloud(points.astype(np.float32), colours, part.normals)
             found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted))
     return found, moved
+
+
+def _grey(points: np.ndarray) -> np.ndarray:
+    return np.full(points.shape, GREY, np.uint8)
 
 
 def _check_points(path: Path, points: np.ndarray) -> None:
@@ -200,8 +220,8 @@ def _in_metres(pose: np.ndarray, unit: float) -> np.ndarray:
 
 
 def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric: bool) -> list[tuple[str, str]]:
-    """Return what is asked about the sizes of scans, metres, and said about rotations that are none; `metric`: the format
-    says the unit, or is one of large places."""
+    """Return what is asked about the sizes of scans, metres, and said about places that floats do not hold and rotations that are none;
+    `metric`: the format says the unit, or is one of large places."""
     said = []
     largest, smallest = int(np.argmax(sizes)), int(np.argmin(sizes))
     if sizes[largest] > MIXED * sizes[smallest]:
@@ -212,6 +232,11 @@ def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric
                              if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[request.unit.value]) <= USUAL_M[1])
         said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {request.unit}? "
                                 f"give --unit{others and f', which may be {others}'}"))
+    for scan in scans:
+        step = float(np.spacing(np.float32(np.abs(scan.points).max())))
+        if scan.converted is None and step > COARSE * np.ptp(scan.points, axis=0).max():
+            said.append(("warning", f"{scan.name} lies so far from the origin that floats of 32 bits hold its points to {step:.2g} m only: "
+                                    "export it with doubles, or with an origin near it"))
     off = max((off_rotation(scan.pose) for scan in scans if scan.pose is not None), default=0.0)
     if off > ROTATION_ROUNDING:
         said.append(("turned", f"rotations were off orthonormal by up to {off:.1g}: the nearest are taken"))
@@ -223,7 +248,7 @@ def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str,
     if request.viewpoint_m is not None:
         facts.append(("viewpoint", f"{','.join(f'{x:g}' for x in request.viewpoint_m)} m in the frame of each scan, as given"))
         return [request.viewpoint_m] * len(scans)
-    said = [scan.viewpoint for scan in scans]
+    said: list[np.ndarray | None] = [scan.viewpoint for scan in scans]
     if all(place is not None for place in said):
         facts.append(("viewpoint", "as the files say"))
     else:
@@ -231,10 +256,16 @@ def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str,
         if found.place is None:
             facts.append(("viewpoint", f"is missing: {found.reason}: give --viewpoint, or relit fuse cannot use the scans"))
         else:
-            said = [place if own is None else own for own, place in zip(said, found.place, strict=True)]
+            said = [_rounded(place, scan.points) if scan.viewpoint is None else scan.viewpoint
+                    for scan, place in zip(scans, found.place, strict=True)]
             facts.append(("viewpoint", f"estimated{f' to about {found.spread_degrees:.0f} degrees' if found.spread_degrees else ''}: "
                                        f"{found.reason}"))
-    return [None if place is None else tuple(float(f"{x:.4g}") for x in place) for place in said]
+    return [None if place is None else tuple(place.tolist()) for place in said]
+
+
+def _rounded(place: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return an estimated place [3] to a ten-thousandth of the size of the points [n, 3], or better."""
+    return np.asarray(np.round(place, int(np.ceil(-np.log10(1e-4 * np.ptp(points, axis=0).max())))))
 
 
 def _conf_poses(path: Path) -> dict[str, np.ndarray]:

@@ -1,5 +1,6 @@
-"""Point clouds as binary PLY files: float32 x y z, uchar red green blue, and normals and intensity when they are known."""
+"""Point clouds as binary PLY files: float32 x y z, uchar red green blue, and what else is known: normals, intensity, σ, confidence."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,9 @@ from stage.errors import ResultError, storage
 from stage.files import replacing
 
 POINTS_FILE = "points.ply"
-POSITION, NORMAL, COLOUR, INTENSITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"), ("intensity",)
+POSITION, NORMAL, COLOUR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+SCALARS = ("intensity", "sigma", "confidence")
+"""Further properties of a point."""
 TYPES = {np.dtype("<f4"): "float", np.dtype("<u2"): "ushort", np.dtype("u1"): "uchar"}
 """The names of the types that are written."""
 MAX_HEADER = 1 << 16
@@ -17,27 +20,31 @@ MAX_HEADER = 1 << 16
 
 
 class PointCloud(NamedTuple):
-    """The points of a capture or a scan with their colours, and their normals and intensities when they are known."""
+    """The points of a capture or a scan with their colours, and what else is known of them."""
 
     points: np.ndarray  # [n, 3] float32 metres, camera frame
     colours: np.ndarray  # [n, 3] uint8, display-encoded (sRGB)
     normals: np.ndarray | None = None  # [n, 3] float32, unit, towards the camera; 0 where the neighbours determine none
     intensity: np.ndarray | None = None  # [n] float32, in the unit of the shots of a scan
+    sigma: np.ndarray | None = None  # [n] float32 metres
+    confidence: np.ndarray | None = None  # [n] float32
 
 
 def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
-    """Write a point cloud as PLY whole or not at all: position, normal, colour and intensity, the last three when they are known.
+    """Write a point cloud as PLY whole or not at all: position, normal, colour, intensity, σ and confidence, those that are known.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
     """
-    kind = _type(cloud.normals is not None, cloud.intensity is not None)
+    scalars = [((name,), None if values is None else values[:, None]) for name, values in
+               zip(SCALARS, (cloud.intensity, cloud.sigma, cloud.confidence), strict=True)]
+    known = [(names, columns) for names, columns in ((POSITION, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), *scalars)
+             if columns is not None]
+    kind = _type(name for names, _ in known for name in names)
     values = np.empty(len(cloud.points), dtype=kind)
-    intensity = None if cloud.intensity is None else cloud.intensity[:, None]
-    for names, columns in ((POSITION, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), (INTENSITY, intensity)):
-        if columns is not None:
-            for column, name in enumerate(names):
-                values[name] = columns[:, column]
+    for names, columns in known:
+        for column, name in enumerate(names):
+            values[name] = columns[:, column]
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(header(kind, len(values), comments))
         values.tofile(stream)
@@ -62,8 +69,7 @@ def read_ply(path: str | Path) -> PointCloud:
         lines = start[:max(end, 0)].decode("ascii", "replace").splitlines()
         counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
         names = tuple(line.split()[-1] for line in lines if line.startswith("property "))
-        with_normals, with_intensity = NORMAL[0] in names, INTENSITY[0] in names
-        kind = _type(with_normals, with_intensity)
+        kind = _type(name for name in (*POSITION, *NORMAL, *COLOUR, *SCALARS) if name in names or name in (*POSITION, *COLOUR))
         if lines[:2] != ["ply", "format binary_little_endian 1.0"] or len(counts) != 1 or names != kind.names:
             raise ResultError(f"{path}: is not a point cloud as relit writes it")
         stream.seek(end + len(b"end_header\n"))
@@ -74,11 +80,9 @@ def read_ply(path: str | Path) -> PointCloud:
     def columns(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([values[name] for name in names], axis=-1)
 
-    return PointCloud(columns(POSITION), columns(COLOUR), columns(NORMAL) if with_normals else None,
-                      values[INTENSITY[0]] if with_intensity else None)
+    return PointCloud(columns(POSITION), columns(COLOUR), columns(NORMAL) if NORMAL[0] in names else None,
+                      *(values[name] if name in names else None for name in SCALARS))
 
 
-def _type(with_normals: bool, with_intensity: bool) -> np.dtype:
-    floats = (*POSITION, *(NORMAL if with_normals else ()))
-    last = INTENSITY if with_intensity else ()
-    return np.dtype([*((name, "<f4") for name in floats), *((name, "u1") for name in COLOUR), *((name, "<f4") for name in last)])
+def _type(names: Iterable[str]) -> np.dtype:
+    return np.dtype([(name, "u1" if name in COLOUR else "<f4") for name in names])

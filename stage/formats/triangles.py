@@ -30,7 +30,9 @@ def read_triangles(path: Path) -> Triangles:
     corners = _obj(content, path) if path.suffix.lower() == OBJ else _stl(content, path)
     if not np.isfinite(corners).all():
         raise ResultError(f"{path}: has a coordinate that is not a number")
-    return without_empty_faces(*_merged(corners), path)
+    points = corners.reshape(-1, 3)
+    kept, place = weld(points)
+    return without_empty_faces(points[kept], place.reshape(-1, 3), path)
 
 
 def without_empty_faces(points: np.ndarray, faces: np.ndarray, path: Path) -> Triangles:
@@ -42,9 +44,12 @@ def without_empty_faces(points: np.ndarray, faces: np.ndarray, path: Path) -> Tr
     return Triangles(points, faces[kept].astype(np.int32))
 
 
-def _merged(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    points, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return points, index.reshape(-1, 3)
+def weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which points [n, 3] are the first at their places, [m] int64 in their order, and the number [n] of each point's place among
+    these."""
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return first[order], np.argsort(order)[place.reshape(-1)]
 
 
 def _stl(content: bytes, path: Path) -> np.ndarray:

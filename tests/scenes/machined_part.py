@@ -103,3 +103,13 @@ def write_stl(path: Path, part: Part) -> Path:
     facets["corners"] = part.points[part.faces]
     path.write_bytes(bytes(80) + np.uint32(len(facets)).tobytes() + facets.tobytes())
     return path
+
+
+def write_mesh(path: Path, part: Part) -> Path:
+    """Write a mesh as PLY, without normals and σ."""
+    faces = np.zeros(len(part.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, part.faces
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(part.points)}", *(f"property float {name}" for name in "xyz"),
+            f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + part.points.astype("<f4").tobytes() + faces.tobytes())
+    return path

@@ -14,6 +14,8 @@ FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 SIGMA, CONFIDENCE, INVENTED = "sigma", "confidence", "invented"
 LIST, CORNERS = "list ", ("vertex_indices", "vertex_index")
 MOST_POINTS = 2**31
+OVERSHOOT = 2.0
+"""Floats below this are from 0 to 1, with what rounding or filters add; of 8 bits they would be black."""
 
 
 class PlyPoints(NamedTuple):
@@ -37,8 +39,9 @@ class _Element(NamedTuple):
 def read_ply_points(path: Path) -> PlyPoints:
     """Read the vertices of a PLY file.
 
-    These are x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma`, `confidence` and `invented`
-    where there are any. Other properties and elements are skipped.
+    These are x, y and z of each vertex; nx, ny, nz, red, green, blue, `sigma`, `confidence` and `invented` where there are any. Other
+    properties and elements are skipped. Colours are of 8 bits, whatever their type, of 16 bits or more where one is above 255, or floats
+    from 0 to 1 where all are below OVERSHOOT.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
@@ -62,8 +65,7 @@ def read_ply_points(path: Path) -> PlyPoints:
 
     colours = columns(COLOUR)
     if colours is not None and colours.dtype != np.uint8:
-        scale = 255.0 if colours.dtype.kind == "f" else 255.0 / np.iinfo(colours.dtype).max
-        colours = np.rint(np.clip(np.nan_to_num(colours * scale), 0, 255)).astype(np.uint8)
+        colours = np.rint(np.clip(np.nan_to_num(colours) * (255 / _full_scale(colours)), 0, 255)).astype(np.uint8)
     normals, sigma, confidence = columns(NORMAL), columns((SIGMA,)), columns((CONFIDENCE,))
     return PlyPoints(points[there], None if normals is None else normals.astype(np.float32), colours,
                      None if sigma is None else sigma[:, 0].astype(np.float64),
@@ -74,6 +76,16 @@ def vertices_of(path: Path) -> int:
     """Return the number of vertices that the header of a PLY file names."""
     with storage("read", path), open(path, "rb") as stream:
         return _header(stream, path)[1][-1].entries
+
+
+def _full_scale(colours: np.ndarray) -> float:
+    """Return the number that is full brightness, by the type and the largest of colours [n, 3]."""
+    most = float(colours[np.isfinite(colours)].max(initial=0))
+    whole = colours.dtype.kind != "f"
+    if not whole and most < OVERSHOOT:
+        return 1.0
+    largest = float(np.iinfo(colours.dtype).max) if whole else 65535.0
+    return 255.0 if most <= 255 else min(65535.0, largest) if most <= 65535 else largest
 
 
 def read_ply_faces(path: Path, kept: np.ndarray) -> np.ndarray | None:

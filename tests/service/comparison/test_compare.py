@@ -11,7 +11,7 @@ from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.errors import ManifestError, ResultError, ScanError
-from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_scan, write_stl
+from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_mesh, write_scan, write_stl
 
 REGIONS = [{"name": "top", "facing": [0, 0, 1], "tolerance": [-0.08, 0.08]},
            {"name": "boss", "box": [[0, -10, 9], [30, 20, 30]], "tolerance": [-0.08, 0.08]},
@@ -128,6 +128,18 @@ def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
     else:
         assert placement["size_factor"] == pytest.approx(factor, abs=1e-4)
         assert any("1.0030" in words and "times as large" in words for words in result.warnings)
+
+
+@pytest.mark.parametrize(("sides", "radius", "factor"), [
+    (256, 15.0, 1.003), pytest.param(256, 15.0, 0.998, marks=pytest.mark.long),
+    (256, 15.1, 1.0), pytest.param(24, 15.0, 1.0, marks=pytest.mark.long)])
+def test_what_is_larger_across_and_not_along_is_no_size_of_the_whole(tmp_path, sides, radius, factor):
+    """A bar that is too thick and exactly as long, and a design with flats in place of the round, are no error of the scanner."""
+    seen = scan_of(cylinder(256, radius), np.random.default_rng(6), 6000)
+    scan = write_scan(tmp_path / "scan.ply", seen._replace(points=factor * seen.points))
+    placement = reported(compare(request(tmp_path, scan, write_stl(tmp_path / "bar.stl", cylinder(sides)), align="refine")))["placement"]
+    assert placement.get("size_factor", 1.0) == pytest.approx(factor, abs=1.5e-4)  # chords of the round, and 6000 points
+    assert ("size_factor" in placement) == (factor != 1)
 
 
 @pytest.mark.long
@@ -274,13 +286,30 @@ def test_inputs_that_say_no_outside_or_no_σ_are_refused(tmp_path, part):
         compare(request(tmp_path, scan, concave))
 
 
-def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part):
+@pytest.mark.parametrize("sigma", [SIGMA_M, None])
+def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part, sigma):
     made, design = part
     plain = scan_of(made, np.random.default_rng(7), 5000)
     found = [compare(request(tmp_path, write_scan(tmp_path / "scan.ply", plain._replace(
-        points=np.repeat(plain.points, often, axis=0), normals=np.repeat(plain.normals, often, axis=0))), design, align="none"))
-        for often in (1, 6)]
-    assert 0.8 < found[1].smallest_fault_m / found[0].smallest_fault_m < 1.2  # medians of 2000 points
+        points=np.repeat(plain.points, often, axis=0), normals=np.repeat(plain.normals, often, axis=0)), sigma), design, align="none",
+        regions=regions(tmp_path))) for often in (1, 4)]
+    assert found[0].sigma_m == found[1].sigma_m and found[0].smallest_fault_m == found[1].smallest_fault_m
+    assert found[0].regions == found[1].regions
+
+
+def test_a_mesh_whose_triangles_have_corners_of_their_own_is_compared_as_one_that_shares_them(tmp_path):
+    fine = machined_part(121, 76)
+    design, normals = write_stl(tmp_path / "part.stl", fine), np.zeros_like(fine.points)
+    for corner in fine.faces.T:
+        np.add.at(normals, corner, fine.normals())
+    off = np.random.default_rng(0).normal(0, 1e3 * SIGMA_M, len(normals))
+    points = fine.points + normals / np.linalg.norm(normals, axis=1, keepdims=True) * off[:, None]
+    apart = points[fine.faces].reshape(-1, 3), np.arange(fine.faces.size).reshape(-1, 3)
+    given = regions(tmp_path, [{"name": "below", "facing": [0, 0, -1], "tolerance": [-0.008, 0.008]}])
+    found = [compare(request(tmp_path, write_mesh(tmp_path / "scan.ply", Part(*mesh)), design, scan_unit="mm", align="none", regions=given))
+             for mesh in ((points, fine.faces), apart)]
+    assert found[1].sigma_m == pytest.approx(found[0].sigma_m) and found[0].sigma_m == pytest.approx(SIGMA_M, rel=0.05)
+    assert found[1].regions == found[0].regions and str(found[0].regions[0].verdict) == "undecided"
 
 
 @pytest.mark.long

@@ -162,6 +162,32 @@ def test_mixtures_at_an_outline_are_left_out(device):
     assert len(np.unique(joined.part[joined.placed])) == 2
 
 
+@pytest.mark.parametrize(("count", "perspective"), [(0, True), (1, True), (1, False), (40, True)])
+def test_single_depths_that_are_far_off_are_rejected(device, count, perspective):
+    view = see("wave", size=SIZE, perspective=perspective)
+    random = np.random.default_rng(1)
+    depth = -view.z + SIGMA * random.standard_normal(view.z.shape)
+    wrong = np.zeros(depth.shape, dtype=bool)
+    wrong.reshape(-1)[random.choice(depth.size, count, replace=False)] = True
+    depth[wrong] += 20 * MM
+    joined, _ = join(view, noise=NOISE, drift=2, sigma=SIGMA, device=device, depth=depth)
+    assert joined.rejected[wrong].all() and (joined.rejected & ~wrong).mean() < 0.01  # beside one, two in line look like mixtures
+    sure = joined.placed & ~joined.rejected & ~joined.guessed
+    assert np.sqrt(np.mean((joined.height - view.z)[sure] ** 2)) < LEAST_RATIO * SIGMA
+
+
+@pytest.mark.parametrize(("share", "off"), [(0.1, 3 * MM), (0.2, 3 * MM), (0.3, 3 * MM), (0.3, -2 * MM)])
+def test_σ_holds_depths_that_are_off_to_one_side_and_too_near_to_be_rejected(device, share, off):
+    view = see("wave", size=SIZE)
+    random = np.random.default_rng(4)
+    depth = -view.z + SIGMA * random.standard_normal(view.z.shape)
+    right, _ = join(view, noise=NOISE, drift=2, sigma=SIGMA, device=device, depth=depth)
+    joined, _ = join(view, noise=NOISE, drift=2, sigma=SIGMA, device=device, depth=depth + off * (random.random(depth.shape) < share))
+    sure = joined.placed & ~joined.rejected & ~joined.guessed
+    assert right.one_sided_m == 0 and 0 < joined.one_sided_m < share * abs(off)
+    assert (np.abs(joined.height - view.z) <= 3 * joined.sigma)[sure].mean() >= 0.95  # as of right depths
+
+
 def test_what_normals_leave_unexplained_tells_a_mirrored_view(device):
     view = see("wave")
     right, _ = join(view, noise=0.5, drift=2, sigma=0.2 * MM, device=device)

@@ -46,6 +46,29 @@ def test_files_of_other_programs_are_read(tmp_path, order, colour):
     np.testing.assert_array_equal(read.sigma, 0.5)
 
 
+@pytest.mark.parametrize(("kind", "full"), [
+    ("uchar", 255), ("ushort", 255), ("ushort", 65535), ("short", 255), ("int", 255), ("int", 65535), ("uint", 255), ("uint", 2**32 - 1),
+    ("float", 1), ("float", 255), ("float", 65535), ("double", 1), ("double", 255)])
+def test_the_scale_of_colours_is_told_by_their_type_and_the_largest(tmp_path, kind, full):
+    part = np.array([[1.0, 0.5, 0.2], [0.8, 0.4, 0], [0.1, 0.6, 0.9]])
+    rows = [" ".join(f"{value:.17g}" for value in (*row, *colour)) for row, colour in
+            zip(np.eye(3), part * full if kind in ("float", "double") else np.rint(part * full), strict=True)]
+    path = tmp_path / "a.ply"
+    path.write_text("\n".join(["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in "xyz"),
+                               *(f"property {kind} {name}" for name in ("red", "green", "blue")), "end_header", *rows, ""]))
+    read = read_ply_points(path)
+    assert read.colours is not None
+    np.testing.assert_allclose(read.colours, 255 * part, atol=0.51)  # rounding to 8 bits, and of floats before it
+
+
+def test_colours_a_little_above_one_are_those_from_0_to_1(tmp_path):
+    path = write(tmp_path / "a.ply", "binary_little_endian", colour="float")
+    path.write_bytes(path.read_bytes().replace(np.float32(1).tobytes(), np.float32(1.02).tobytes()))
+    read = read_ply_points(path)
+    assert read.colours is not None
+    np.testing.assert_array_equal(read.colours, np.tile([255, 0, 255], (3, 1)))
+
+
 @pytest.mark.parametrize(("change", "sentence"), [
     (lambda raw: raw[:-40], "is truncated"),
     (lambda raw: raw.replace(b"ply\n", b"plx\n", 1), "is not a PLY file"),
