@@ -43,7 +43,7 @@ from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.settling import as_shown, middles_of, settle
-from service.solve.methods.support import FEW_LIGHTS, supports_lobes
+from service.solve.methods.support import FEW_LIGHTS, support_of
 from service.solve.methods.unseen_metals import replace_unseen_metals
 from stage.colour.colour import GREY_WEIGHTS
 
@@ -51,9 +51,6 @@ SHARED_PAIRS = 384
 """Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
-PRIOR_STRENGTH = 10.0
-"""Strength of the prior towards the normals of a simpler method where the general solver is not supported: a standard deviation of some
-degrees for a reading that misfits by the noise floor of the search."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +118,7 @@ class _Walk:
         self._simple = np.zeros_like(self.result.normal)  # normals that it is drawn to where few lights do not support more
         self._robust = self.result.normal
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._lobe, self._supported = Diffuse(), Diffuse(), True
+        self._shape, self._lobe, self._supported, self._pull = Diffuse(), Diffuse(), True, 0.0
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -160,9 +157,9 @@ class _Walk:
         if self._few:
             start = pair_starts(self._solved, LOBE_PIXELS)
             pixels = np.concatenate([start, start + APART]) if len(start) else np.tile(self._spread, 2)
-            simpler = supports_lobes(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
-            self._supported = simpler is None
-            self._simple = self._robust if simpler is Method.ROBUST else self._simple
+            support = support_of(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
+            self._supported, self._pull = support.lobes, support.pull
+            self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
         samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._supported:
             shapes = choose_diffuse(samples, normal)
@@ -271,13 +268,14 @@ class _Walk:
                                  pairs=kind.pairs, metals=kind.metals, roughness=roughness, prior=self._prior(pixels),
                                  beside=self._beside(pixels), shared_misfit=shared)
             result.normal[:, pixels] = found.normal.T
-            material = fit_given(samples, found.normal, MATT, shape=kind.lobe) if self._matt else found
+            plain = self._matt or self._pull > 0
+            material = fit_given(samples, found.normal, MATT, shape=kind.lobe) if plain else found
             result.albedo[:, pixels] = half(material.diffuse_albedo.T)
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
-            error = albedo_error(samples, found.normal, material, shape=kind.lobe, shared=MATT[None] if self._matt else kind.materials)
+            error = albedo_error(samples, found.normal, material, shape=kind.lobe, shared=MATT[None] if plain else kind.materials)
             own[:, pixels], tilt[:, pixels] = (half(each.T) for each in error)
-            abundance[pixels], pair[pixels] = found.mixture
+            abundance[pixels], pair[pixels] = (0, 0) if plain else found.mixture
             pair[pixels[found.mixture.abundance > 0]] += np.uint8(first_pair)
             sigma[pixels], result.residual[pixels] = found.sigma, found.residual
             if self._seeks_metals:
@@ -331,7 +329,7 @@ class _Walk:
 
     def _prior(self, pixels: np.ndarray) -> Prior | None:
         """Return what is expected of the normals of some pixels."""
-        return None if self._supported else Prior(self._simple[:, pixels].T, PRIOR_STRENGTH)
+        return Prior(self._simple[:, pixels].T, self._pull) if self._pull else None
 
     def _pick(self, pixels: np.ndarray) -> Samples:
         """Return the readings of a few pixels, wherever they lie in the image."""
