@@ -25,7 +25,7 @@ from stage.errors import CalibrationError, ImageError
 from stage.formats import exr, images
 from stage.formats.camera_raw import path_is_raw, rec709_from_camera
 from stage.pixels import Crop
-from stage.stack.correction import FULL_SCALE
+from stage.stack.correction import saturation_limit
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
 BIN = 0.01
@@ -202,18 +202,18 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     if not paths:
         raise CalibrationError("no image is given")
     manifest = capture.manifest
-    mask = capture.mask() if refuse_saturated and manifest.saturation is not None else None
+    mask = capture.mask() if refuse_saturated else None
     total = np.zeros((capture.camera.height, capture.camera.width, 3))
     squares = 0.0
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
-        if mask is not None and manifest.saturation is not None:
-            count = int((np.any(recorded >= manifest.saturation, axis=-1) & mask).sum())
+        if mask is not None:
+            limit = saturation_limit(manifest, path)
+            count = int((np.any(recorded >= limit, axis=-1) & mask).sum())
             if count:
-                raise ImageError(f"{path}: {count} pixels are at or above the saturation of {manifest.saturation:g}: "
-                                 "shorten the exposure")
+                raise ImageError(f"{path}: {count} pixels are at or above the saturation of {limit:g}: shorten the exposure")
         linear = linearise(recorded, manifest.color_space).astype(np.float64)
         total += linear
         squares += float((linear**2).mean())
@@ -278,11 +278,10 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         raise RequestError(f"--sensor-colors: is about camera raw files, and {request.images[0]} is none")
     timings.stage("images", len(request.images))
     for path in request.images:
-        if images.read_header(path).integer:
-            over = int((region.of(images.read_pixels(path)) >= FULL_SCALE).any(axis=-1).sum())
-            if over:
-                raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region "
-                                       "without them")
+        over = int((region.of(images.read_pixels(path)) >= saturation_limit(capture.manifest, path)).any(axis=-1).sum())
+        if over:
+            raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region without "
+                                   "them")
     card = region.of(mean_image(request.images, capture, progress=timings.advance).pixels)
     if capture.manifest.dark is not None:
         card = card - region.of(linearise(capture.recorded(capture.manifest.dark), capture.manifest.color_space))

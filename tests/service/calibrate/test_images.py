@@ -90,6 +90,24 @@ def test_cards_that_are_refused(folder):
         make_flat(grey, mean_image(images(folder, "d", [np.full((SIZE, SIZE, 3), 0.2)]), capture), capture)
 
 
+def test_a_clipped_white_card_is_refused_where_the_manifest_says_no_saturation(relit, folder):
+    """The largest integer is clipped; a card below it, or one in floating point, is not."""
+    levels = np.linspace(200, 400, SIZE * SIZE).reshape(SIZE, SIZE, 1) * np.ones(3)
+    card = write_image(folder.parent / "card.png", np.uint8(np.minimum(levels, 255)))
+    count = (levels[..., 0][Capture.open(folder).mask()] >= 255).sum()
+    assert f"card.png: {count} pixels are at or above the saturation of 1" in relit.refused("calibrate", "flat-field", folder, card)
+    relit.done("calibrate", "flat-field", folder, write_image(folder.parent / "darker.png", np.uint8(levels * 0.6)))
+    relit.done("calibrate", "flat-field", folder, write_exr(folder.parent / "card.exr", levels / 100))
+
+
+def test_a_card_above_the_saturation_of_the_manifest_gives_no_white_balance(relit, folder):
+    """Fourteen bits in sixteen end at a quarter of full scale, where every colour becomes grey."""
+    edit_manifest(folder, saturation=0.249)
+    card = write_exr(folder.parent / "card.exr", np.minimum(np.ones((SIZE, SIZE, 3)) * (0.4, 0.3, 0.2), 0.25))
+    assert f"card.exr: {SIZE * SIZE} pixels of the card are saturated" in relit.refused("calibrate", "white-balance", folder, card)
+    relit.done("calibrate", "white-balance", folder, write_exr(folder.parent / "card2.exr", np.ones((SIZE, SIZE, 3)) * (0.2, 0.15, 0.1)))
+
+
 def test_a_dark_image_with_light_in_it_is_refused(relit, tmp_path):
     folder = write_capture(tmp_path / "cap", make_scene(32, 3))
     before = (folder / "capture.json").read_bytes()
