@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from service.calibrate.response import fit_response
-from service.calibrate.sensor import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
+from service.calibrate.sensor import make_flat, mean_image, recorded_values
 from service.calibrate.solvers.card_faults import card_faults
+from service.calibrate.solvers.saturation_level import ChannelSaturation, ReadingHistogram, capture_saturation
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr
@@ -143,21 +144,40 @@ def test_a_region_with_more_than_the_card_is_said(relit, tmp_path):
     assert "colours in it differ" in relit.done("calibrate", "white-balance", folder, write_exr(tmp_path / "half.exr", card)).out
 
 
-def pile(values, peak=None):
-    top = TopHistogram(float(values.max() if peak is None else peak))
-    for part in np.array_split(values, 3):
-        top.add(part)
-    return top.saturation()
+def pile(*images):
+    histogram = ReadingHistogram(float(max(image.max() for image in images)))
+    for image in images:
+        histogram.add(image)
+    return histogram.saturation()
 
 
 def test_a_pile_at_the_top():
     rng = np.random.default_rng(2)
-    light = rng.exponential(0.4, 20_000)
-    found = pile(np.minimum(light, 0.8) + 0.001 * rng.standard_normal(20_000))
-    assert found.level == pytest.approx(0.8, rel=0.02) and found.readings > 2000
-    assert pile(light) == ChannelSaturation(None, 0)
-    assert pile(rng.uniform(0, 1, 20_000)) == ChannelSaturation(None, 0)  # a flat histogram is no pile
+    light = rng.exponential(0.4, (3, 7_000))
+    found = pile(*np.minimum(light, 0.8))
+    assert found.level == pytest.approx(0.792) and found.readings == (light >= 0.792).sum()
+    assert pile(*light) == ChannelSaturation(None, 0)
+    assert pile(*rng.uniform(0, 1, (3, 7_000))) == ChannelSaturation(None, 0)  # a flat histogram is no pile
     assert pile(np.zeros(100)) == ChannelSaturation(None, 0)
+    hot = np.where(rng.random(light.shape) < 0.001, 0.95, np.minimum(light, 0.8))
+    assert pile(*hot).level == pytest.approx(0.792, rel=1e-4)  # told apart to 1.5e-5 of the largest value
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_bright_things_are_no_pile(bits):
+    """Spheres without noise, of which eight bits have few codes, and half an image at one brightness, with the noise of 60 000 electrons
+    or with another one in each image."""
+    rng, codes = np.random.default_rng(3), 2**bits - 1
+    y, x = np.mgrid[-1:1:121j, -1:1:121j]
+    sphere = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    for peak in (0.1, 0.35, 0.8):
+        spheres = [np.rint(codes * sphere * light) / codes for light in (0.7 * peak, 0.9 * peak, peak)]
+        assert pile(*spheres) == ChannelSaturation(None, 0)
+        backs = [np.where(x > 0, light, ball) for light, ball in zip((0.5, 0.55, 0.6), spheres, strict=True)]
+        assert pile(*(np.rint(codes * back) / codes for back in backs)) == ChannelSaturation(None, 0)
+        noisy = [np.where(x > 0, 0.6, ball) + 0.004 * rng.standard_normal(x.shape) for ball in spheres]
+        assert pile(*(np.rint(codes * np.maximum(back, 0)) / codes for back in noisy)) == ChannelSaturation(None, 0)
+        assert pile(*(np.minimum(ball, 0.6 * peak) for ball in spheres)).level == pytest.approx(0.594 * peak, rel=1e-4)
 
 
 def test_the_least_level_stands_for_all_channels():
