@@ -297,6 +297,24 @@ def test_images_that_contradict_the_response_are_said(change, words):
     assert (found.faults == ()) if words is None else any(words in fault for fault in found.faults), found.faults
 
 
+def video(levels):
+    return np.clip((255 * levels - 16) / 219, 0, 1) ** 2.2
+
+
+@pytest.mark.parametrize(("light", "words"), [
+    (lambda levels: levels**2.2, None),
+    (video, None),
+    (lambda levels: levels * levels * (3 - 2 * levels), None),
+    (lambda levels: np.minimum(levels**2.2, 0.65), "does not rise above level 0.875"),
+    (lambda levels: levels**2.2 * (1 + 0.03 * np.random.default_rng(5).standard_normal(levels.size)), "% from level to level"),
+], ids=["power", "black and white of video", "S", "clipped", "flicker"])
+def test_an_even_wall_tells_of_clipped_and_of_flickering_light(light, words):
+    levels = np.linspace(0, 1, 17)
+    images = 0.3 * light(levels)[:, None] + RNG.normal(0, 0.001, (17, 2000))
+    faults = fit_response(levels, images.astype(np.float32)).faults
+    assert (faults == ()) if words is None else any(words in fault for fault in faults), faults
+
+
 def test_readings_at_full_scale_of_an_image_take_no_part(relit, tmp_path):
     """Most pixels of 8-bit images clip at the brighter levels, and no saturation is declared."""
     folder = write_capture(tmp_path / "cap", make_scene(COLS, 3))
