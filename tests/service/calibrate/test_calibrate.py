@@ -271,6 +271,8 @@ BAD = {
     "albedo": (["grey-ball", *BALL, "--albedo", "0.5,0.5"], {}, "--albedo 0.5,0.5: give one number or three"),
     "radii": (["light-positions", *BALL, *BALL, *BALL, "--ball-radius-m", "0.1", "--ball-radius-m", "0.1"], {},
               "--ball-radius-m: is given 2 times for 3 balls"),
+    "radius in millimetres": (["light-positions", *BALL, "--ball", "20,20,10", "--ball-radius-m", "30"], {},
+                              "--ball-radius-m: is 30, and no calibration ball has a radius of 30 m: give it in metres"),
     "radius against scale": (["light-positions", *BALL, *BALL, "--ball-radius-m", "0.1"], {},
                              "it ball 1 has a radius of 0.03 m, --ball-radius-m says 0.1"),
     "no scale": (["light-positions", *BALL, *BALL, "--ball-radius-m", "0.03"],

@@ -89,6 +89,17 @@ def test_lamps_of_one_place_and_places_in_millimetres_are_said(relit, tmp_path):
     assert "B and C stand in one direction" in shown and "lights[].position_m: the lamps stand 1.5e+03 m" in shown
 
 
+@pytest.mark.parametrize(("unit", "said"), [(1, True), (1000, False)], ids=["metres", "millimetres"])
+def test_a_scene_in_metres_is_said(relit, tmp_path, unit, said):
+    """Places of MVR are millimetres."""
+    places = [f"{2 * unit},{3 * unit},{4 * unit}", f"{-2 * unit},{3 * unit},{4 * unit}"]
+    (tmp_path / "scene.mvr").write_bytes(mvr("".join(fixture(f"L{at}", "Par", "RGB 8 bit", place, 1 + 9 * at) for at, place
+                                                     in enumerate(places)), Par=RGB))
+    relit.done("rig", "from-mvr", tmp_path / "scene.mvr", "--out", tmp_path / "rig.json")
+    shown = relit.done("rig", "check", tmp_path / "rig.json").out
+    assert ("the lamps stand 0.00539 m from the subject (median): are the places of the scene metres" in shown) == said
+
+
 def test_more_lamps_plan_a_smaller_error(relit, tmp_path):
     write_sky(tmp_path / "sky.exr", "sun", rows=32)
     write_rig(tmp_path / "rig.json", fibonacci_sphere(64), name='the "new" dome')
