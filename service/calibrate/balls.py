@@ -95,7 +95,7 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
-    """Check that the size of each ball in metres is known and that of a ball, and that two sources of it agree."""
+    """Check that the size of each ball in metres is known and plausible, and that two sources of it agree."""
     odd = next((radius for radius in radii if not PLAUSIBLE_RADIUS_M[0] <= radius <= PLAUSIBLE_RADIUS_M[1]), None)
     if odd is not None:
         raise RequestError(f"--ball-radius-m: is {odd:g}, and no calibration ball has a radius of {odd:g} m: give it in metres")

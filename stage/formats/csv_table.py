@@ -36,8 +36,8 @@ def read_table(path: Path, columns: Sequence[str]) -> "csv.DictReader[str]":
     cells = csv.reader(lines)
     for row in cells:
         if any(cell.strip() for cell in row[len(heads):]):
-            raise ManifestError(f"{path}: line {cells.line_num}: has {len(row)} cells, the first line names {len(heads)} columns: part "
-                                "columns by semicolons where numbers have decimal commas")
+            hint = ": part columns by semicolons where numbers have decimal commas" if separator is None else ""
+            raise ManifestError(f"{path}: line {cells.line_num}: has {len(row)} cells, the first line names {len(heads)} columns{hint}")
     return rows
 
 
