@@ -23,6 +23,8 @@ from stage.errors import CalibrationError, ManifestError
 from stage.formats import images
 from stage.stack.correction import Correction
 
+PLAUSIBLE_RADIUS_M = 2e-4, 1.0
+"""Radii of calibration balls, from those of bearings to those of gazing globes; beyond them the unit is another."""
 RADIUS_TOLERANCE = 0.05
 """Relative difference of a ball's radius in metres from its radius in pixels × pixel_size_m, above which one of them must be wrong."""
 FRAMES = 16
@@ -93,7 +95,10 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
-    """Check that the size of each ball in metres is known, and that two sources of it agree."""
+    """Check that the size of each ball in metres is known and plausible, and that two sources of it agree."""
+    odd = next((radius for radius in radii if not PLAUSIBLE_RADIUS_M[0] <= radius <= PLAUSIBLE_RADIUS_M[1]), None)
+    if odd is not None:
+        raise RequestError(f"--ball-radius-m: is {odd:g}, and no calibration ball has a radius of {odd:g} m: give it in metres")
     if capture.camera.projection == "perspective":
         if not radii:
             raise RequestError("--ball-radius-m: is missing: a perspective camera sees the size of a ball, not its distance")

@@ -31,7 +31,7 @@ from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction,
 from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_point
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
-from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction
+from service.light_estimation.grey_ball import better_encoding, dark_side, fit_brightness, fit_direction
 from service.light_estimation.semi_calibrated import check_directions, fit_intensities, part_uncertainty
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
@@ -48,6 +48,8 @@ UNSURE = 0.05
 """Median uncertainty of the brightness of lights, relative, from which the object is said to be none to measure them on."""
 WIDE = 2.0
 """The size of the spot of a lamp over the median of all, from which something beside the lamp may be a part of it."""
+ROOM_LIGHT = 0.03
+"""Light on the dark side of a grey ball, over that where it faces a lamp, from which on it is said; dark rooms give one or two percent."""
 BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
@@ -195,13 +197,21 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
         if other is not None:
             flags = [f"color_space: {declared} is declared, but as {other[0]} the shading of the ball fits to {100 * other[1]:.1f} %, as "
                      f"declared to {100 * found.residual:.1f} %"]
+        room = dark_side(patch.radiance, patch.saturated, light, view, found.scale)
         scale = found.scale * (ANALYSER_GAIN if light.polarization != "none" else 1)
-        entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels, "flags": flags}
+        entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels,
+                  "dark_side": None if room is None else round(room, 4), "flags": flags}
         return MeasuredLight(with_brightness(light, scale), entry, (), found.residual)
 
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=False),
                                  drop_failed=request.drop_failed)
     timings.close()
+    told = [result.entry for result in results if result.light is not None and result.entry["dark_side"] is not None]
+    fitting = [entry for entry in told if not entry["flags"]] or told  # a light from elsewhere than declared reaches that side
+    room_light = float(np.median([entry["dark_side"] for entry in fitting])) if fitting else 0.0
+    if room_light > ROOM_LIGHT:
+        warnings = [*warnings, f"the dark side of the ball has {100 * room_light:.0f} % of the light, from the room or a dark level of the "
+                               "camera, which makes irradiances and directions wrong: add a frame of type off, or a dark image"]
     return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
                         headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None,
                         warnings=warnings)

@@ -25,7 +25,7 @@ from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.colour.radiance import check_radiance
 from stage.errors import CalibrationError, ManifestError
 from stage.formats import images
-from stage.stack.correction import FULL_SCALE
+from stage.stack.correction import saturation_limit
 
 EVEN_LEVELS = 256
 """The count of levels of the response, which is that of an eight-bit projector."""
@@ -67,8 +67,7 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded)
         flat = recorded.reshape(-1, 3)[inside]
-        limit = manifest.saturation if manifest.saturation is not None else FULL_SCALE if images.read_header(path).integer else np.inf
-        usable &= (flat < limit).all(axis=-1)
+        usable &= (flat < saturation_limit(manifest, path)).all(axis=-1)
         linear = linearise(recorded, manifest.color_space).reshape(-1, 3)[inside]
         readings[number] = linear @ np.array(GREY_WEIGHTS, np.float32)
         timings.advance(number + 1)

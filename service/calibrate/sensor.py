@@ -14,6 +14,7 @@ import numpy as np
 from service import __version__
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
 from service.calibrate.solvers.card_faults import card_faults, check_dark, mixed_colours
+from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest, WhiteBalanceRequest
@@ -25,15 +26,9 @@ from stage.errors import CalibrationError, ImageError
 from stage.formats import exr, images
 from stage.formats.camera_raw import path_is_raw, rec709_from_camera
 from stage.pixels import Crop
-from stage.stack.correction import FULL_SCALE
+from stage.stack.correction import saturation_limit
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
-BIN = 0.01
-"""The width of the compared bins, relative to the largest value."""
-MIN_COUNT = 20
-"""The least count of saturated readings: fewer may belong to one highlight."""
-EXCESS = 3.0
-"""The least ratio of the readings in the top bin to the mean of the two bins below, because a smooth histogram falls towards its end."""
 
 
 class ImageCalibration(NamedTuple):
@@ -98,15 +93,15 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
     for number, path in enumerate(paths, start=1):
         peaks = np.maximum(peaks, _recorded(path).max(axis=(0, 1)))
         timings.advance(number)
-    tops = [TopHistogram(float(peak)) for peak in peaks]
+    histograms = [ReadingHistogram(float(peak)) for peak in peaks]
     timings.stage("histogram", len(paths))
     for number, path in enumerate(paths, start=1):
         recorded = _recorded(path)
-        for channel, top in enumerate(tops):
-            top.add(recorded[..., channel])
+        for channel, histogram in enumerate(histograms):
+            histogram.add(recorded[..., channel])
         timings.advance(number)
     timings.close()
-    channels = [top.saturation() for top in tops]
+    channels = [histogram.saturation() for histogram in histograms]
     try:
         level = capture_saturation(channels)
     except CalibrationError as error:
@@ -117,45 +112,6 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
     report = write_results("saturation", request, capture.manifest.model_copy(update={"saturation": level}), manifest_path,
                            {"level": level, "counts": counts})
     return Saturation(level, counts, manifest_path, report)
-
-
-class ChannelSaturation(NamedTuple):
-    """The saturation of one channel."""
-
-    level: float | None
-    """The value at and above which readings are saturated, or None when none are."""
-    readings: int
-    """The count of readings at or above the level."""
-
-
-class TopHistogram:
-    """The three topmost bins of the histogram of one channel over many images, the largest value of all of which is `peak`."""
-
-    def __init__(self, peak: float) -> None:
-        self.peak = peak
-        self._counts = np.zeros(3, dtype=np.int64)
-
-    def add(self, values: np.ndarray) -> None:
-        """Count the recorded values of an image, an array of any shape."""
-        if self.peak > 0:
-            edges = self.peak * (1 - BIN * np.array([3, 2, 1]))
-            above = [int((values >= edge).sum()) for edge in edges]
-            self._counts += [above[2], above[1] - above[2], above[0] - above[1]]
-
-    def saturation(self) -> ChannelSaturation:
-        """Return the saturation of the channel: whether the top bin holds more readings than the bins below explain."""
-        top, *below = (int(count) for count in self._counts)
-        saturated = top >= MIN_COUNT and top > EXCESS * (sum(below) / len(below) + 1)
-        return ChannelSaturation(self.peak * (1 - BIN) if saturated else None, top if saturated else 0)
-
-
-def capture_saturation(channels: list[ChannelSaturation]) -> float:
-    """Return the saturation of a capture, one number for all channels: the least level of a channel, to four digits.
-    Raises CalibrationError if no channel saturates."""
-    levels = [channel.level for channel in channels if channel.level is not None]
-    if not levels:
-        raise CalibrationError("no channel piles up at its largest value: nothing shows where readings saturate")
-    return float(f"{min(levels):.4g}")
 
 
 def _recorded(path: Path) -> np.ndarray:
@@ -202,18 +158,18 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     if not paths:
         raise CalibrationError("no image is given")
     manifest = capture.manifest
-    mask = capture.mask() if refuse_saturated and manifest.saturation is not None else None
+    mask = capture.mask() if refuse_saturated else None
     total = np.zeros((capture.camera.height, capture.camera.width, 3))
     squares = 0.0
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
-        if mask is not None and manifest.saturation is not None:
-            count = int((np.any(recorded >= manifest.saturation, axis=-1) & mask).sum())
+        if mask is not None:
+            limit = saturation_limit(manifest, path)
+            count = int((np.any(recorded >= limit, axis=-1) & mask).sum())
             if count:
-                raise ImageError(f"{path}: {count} pixels are at or above the saturation of {manifest.saturation:g}: "
-                                 "shorten the exposure")
+                raise ImageError(f"{path}: {count} pixels are at or above the saturation of {limit:g}: shorten the exposure")
         linear = linearise(recorded, manifest.color_space).astype(np.float64)
         total += linear
         squares += float((linear**2).mean())
@@ -278,11 +234,10 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         raise RequestError(f"--sensor-colors: is about camera raw files, and {request.images[0]} is none")
     timings.stage("images", len(request.images))
     for path in request.images:
-        if images.read_header(path).integer:
-            over = int((region.of(images.read_pixels(path)) >= FULL_SCALE).any(axis=-1).sum())
-            if over:
-                raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region "
-                                       "without them")
+        over = int((region.of(images.read_pixels(path)) >= saturation_limit(capture.manifest, path)).any(axis=-1).sum())
+        if over:
+            raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region without "
+                                   "them")
     card = region.of(mean_image(request.images, capture, progress=timings.advance).pixels)
     if capture.manifest.dark is not None:
         card = card - region.of(linearise(capture.recorded(capture.manifest.dark), capture.manifest.color_space))

@@ -12,7 +12,16 @@ from kernels.device import to_numpy
 from kernels.photometric.model.samples import evenly
 from kernels.tof.continuous.continuous import decode
 from service.calibrate.results import digits, write_report
-from service.calibrate.solvers.tof_sweep import Fit, StepPhases, all_readings, contradicting, fit_steps, fit_wiggling, target_faults
+from service.calibrate.solvers.tof_sweep import (
+    Fit,
+    StepPhases,
+    all_readings,
+    contradicting,
+    fit_steps,
+    fit_wiggling,
+    target_faults,
+    wiggling_sigma,
+)
 from service.depth.tof.continuous_wave import estimate_noise
 from service.depth.tof.tof import solve_tof, z_per_range
 from service.errors import RequestError
@@ -48,7 +57,9 @@ MOST_WRONG = 0.2
 FEWEST = 5
 """Fewest steps of which one can contradict the others."""
 DETERMINED = 0.5
-"""Error at a distance that is left out, as a part of that without a calibration, above which more distances are needed."""
+"""Standard deviation of ranges, as a part of their errors without a calibration, above which more distances are needed."""
+MOST_SCALED = 0.05
+"""Part by which measured distances are wrong beside declared ones beyond which no clock of a camera makes them; crystals keep 10⁻⁴."""
 
 
 class TofCalibrationResult(NamedTuple):
@@ -88,8 +99,9 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     if plan.has_drift:
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
         drift, level = fit_temperature(after[used], warm[used])
-        calibration = calibration.model_copy(update={"temperature": drift, "offset_m": calibration.offset_m + level})
         after = after - level - drift.metres_per_c * (warm - drift.reference_c)
+        sigma = None if found.sigma_m is None else float(f"{np.hypot(found.sigma_m, after[used].std(ddof=1)):.3g}")
+        calibration = calibration.model_copy(update={"temperature": drift, "offset_m": calibration.offset_m + level, "sigma_m": sigma})
     write_calibration(calibration, request.out)
     report = write_report("tof", request, request.out.parent, {
         "steps": [{"capture": step.capture, "depth_m": step.depth_m, "error_m": error, "used": bool(kept)}
@@ -142,7 +154,7 @@ class _Found(NamedTuple):
     known: dict[str, Any]
     """Entries of the calibration."""
     sigma_m: float | None
-    """The standard deviation of ranges that it leaves open; None: the steps are too few to tell."""
+    """The standard deviation of ranges that it leaves open, before a drift with temperature; None: the steps are too few to tell."""
     left_out: list[int]
     """The steps whose distances contradict the others."""
     warnings: tuple[str, ...]
@@ -159,7 +171,17 @@ def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Foun
 
     kept, left_out, warnings = _consistent(plan, errors, range(len(captures)), lambda steps: -off(steps).scatter)
     scale, offset = fit_line(measured[kept], true[kept])
-    return _Found({"scale": scale, "offset_m": offset}, off(kept).sigma if len(kept) > 2 else None, left_out, warnings)
+    if abs(scale - 1) > MOST_SCALED:
+        raise RequestError(f"steps: depth_m grows by {scale:.3g} m for each metre of the measured ranges: check depth_m, its unit, the "
+                           "order of the captures, and their bin_s")
+    middle, spread = float(measured[kept].mean()), float(measured[kept].std())
+    entries = {"scale": scale, "offset_m": offset}
+    if len(kept) < 3:
+        return _Found(entries, None, left_out, warnings)
+    left = true[kept] - scale * measured[kept] + offset
+    sigma = float(np.sqrt(np.sum(left**2) / (len(kept) - 2)))  # of any other distance, which a line through a bend misses by as much
+    entries |= {"middle_m": float(f"{middle:.4g}"), "scale_sigma": float(f"{sigma / spread / np.sqrt(len(kept)):.3g}")}
+    return _Found(entries, sigma, left_out, warnings)
 
 
 def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, device: str, timings: Timings) -> _Found:
@@ -188,10 +210,14 @@ def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, devi
                                "of them, which is taken out")
     scale = target_faults(some(highest, kept), highest).scale
     tables = tuple(fit_harmonics(*all_readings(some(hz, kept)), hz) for hz in phases)
-    sigma = fit_wiggling(some(highest, kept), highest).sigma * per_radian
-    if sigma > DETERMINED * errors[kept].std():
-        warnings = (*warnings, f"steps: ranges at a distance that is left out are off by {sigma:.2g} m, and by {errors[kept].std():.2g} m "
-                               "without a calibration: measure at more distances")
+    known = wiggling_sigma({hz: some(hz, kept) for hz in phases})
+    sigma = known.most_m
+    if known.unseen is not None:
+        warnings = (*warnings, f"steps: no distance shows the phases of ranges of about {known.range_m[known.unseen]:.3g} m, where "
+                               f"ranges may be off by {known.sigma_m[known.unseen]:.2g} m: measure there too")
+    elif sigma > DETERMINED * errors[kept].std():
+        warnings = (*warnings, f"steps: ranges are off by {sigma:.2g} m, and by {errors[kept].std():.2g} m without a calibration: measure "
+                               "at more distances")
     if scale is not None:
         reach = float(np.median([plan.steps[step].depth_m for step in kept]))
         sigma = float(np.hypot(sigma, (scale - 1) * reach))

@@ -36,8 +36,7 @@ from stage.colour.radiance import clipping_sentences
 from stage.errors import StageError, StorageError
 from stage.formats import images
 from stage.formats.exif import TURNS, UPRIGHT
-from stage.formats.images import read_header
-from stage.stack.correction import FULL_SCALE, Correction
+from stage.stack.correction import Correction, saturation_limit
 from stage.tof.raw_frames import check_frames, read_frame
 
 MOST_NAMED = 6
@@ -310,8 +309,7 @@ def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.
     lit = capture.lit_by(DistantLight)
     correction = Correction.of(capture).at(positions)
     radiance = np.stack([correction.corrected(recorded[frame.image][:, None], frame)[:, 0] for frame, _ in lit]).astype(np.float64)
-    limit = capture.manifest.saturation
-    limits = [limit or (FULL_SCALE if read_header(capture.file(frame.image)).integer else np.inf) for frame, _ in lit]
+    limits = [saturation_limit(capture.manifest, capture.file(frame.image)) for frame, _ in lit]
     usable = np.stack([(recorded[frame.image] < np.float32(most)).all(axis=-1) for (frame, _), most in zip(lit, limits, strict=True)])
     sample = Sample(radiance, usable, np.array([light.direction for _, light in lit]), np.array([light.irradiance for _, light in lit]),
                     np.array([frame.exposure_s or 1.0 for frame, _ in lit]), capture.manifest.color_space)

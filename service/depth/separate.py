@@ -117,11 +117,12 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     if not solved.any():
         raise ManifestError(f"{capture.folder}: no pixel is separated ({counts['saturated']} saturated): expose the phase frames for less")
     total = (light.direct + light.indirect).sum(axis=-1)
-    ratio = _sum_over_white(Correction.of(capture).apply if joined is None else joined.read, frames, collected, total, solved)
+    ratios = _sum_over_white(Correction.of(capture).apply if joined is None else joined.read, frames, collected, total, solved)
+    ratio = None if ratios is None else float(np.nanmedian(ratios))
     if ratio is not None and abs(ratio - 1) > SUM_TOLERANCE:
         raise ManifestError(f"{capture.folder}: direct and global light add up to {ratio:.2f} of the white frame: the patterns must be "
                             "linear in light (relit patterns --gamma, color_space), and ambient light needs a black or an off frame")
-    warnings = [*clipping_sentences(capture.clipped), *check.faults()]
+    warnings = [*clipping_sentences(capture.clipped), *check.faults(ratios)]
     timings.stage("write", 1)
     content = content_of(capture)
     path, report_path = request.out / SEPARATION_FILE, request.out / REPORT_FILE
@@ -192,7 +193,8 @@ def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposu
             usable = mask[band].reshape(-1)
             if planes.saturated is not None:
                 usable = usable & ~planes.saturated[:, band].reshape(len(used), -1).any(axis=0)
-            check.add(values, usable, [([place[number] for number in sinusoid.frames], sinusoid.shifts) for sinusoid in sinusoids])
+            check.add(values, usable, [([place[number] for number in sinusoid.frames], sinusoid.shifts) for sinusoid in sinusoids],
+                      first=band.start * mask.shape[1])
             readings = upload(values, bits, device=device)
             parts = [separate_band(readings, [place[number] for number in sinusoid.frames], sinusoid.shifts, period_px=period_px,
                                    black=place[black[0]] if black else None, leak=request.black_level) for sinusoid in sinusoids]
@@ -206,12 +208,16 @@ def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposu
                     mean /= planes.exposure[band]
                 whole[band] = np.where((light.status[band] == OK)[..., None], np.moveaxis(mean, 0, -1), 0)
             timings.advance(band.stop)
+    if check.copies is not None:
+        one, other = (frames[used[number]].image for number in check.copies)
+        raise ManifestError(f"{capture.folder}: {other} is an exact copy of {one}, where another shift is declared: record it again")
     return light
 
 
 def _sum_over_white(read: Callable[[Frame], Radiance], frames: list[Frame], collected: Collected, total: np.ndarray,
-                    solved: np.ndarray) -> float | None:
-    """Return the median of direct and global light together over the white frame; None without one, or if nothing is lit."""
+                    solved: np.ndarray) -> np.ndarray | None:
+    """Return direct and global light together over the white frame, [pixels], NaN where it is not lit; None without one, or if nothing is
+    lit."""
     if collected.white is None:
         return None
     white = read(frames[collected.white])
@@ -219,7 +225,7 @@ def _sum_over_white(read: Callable[[Frame], Radiance], frames: list[Frame], coll
     if collected.black is not None:
         light = light - read(frames[collected.black]).pixels
     lit = _lit(light.sum(axis=-1), solved if white.saturated is None else solved & ~white.saturated)
-    return float(np.median(total[lit] / light.sum(axis=-1)[lit])) if lit.any() else None
+    return np.divide(total, light.sum(axis=-1), out=np.full(total.shape, np.nan), where=lit).reshape(-1) if lit.any() else None
 
 
 def _lit(light: np.ndarray, usable: np.ndarray) -> np.ndarray:

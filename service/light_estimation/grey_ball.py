@@ -32,6 +32,9 @@ WEIGHT_SCALE = 2.385
 LEAST_MISFIT, TIMES = 0.05, 2.5
 """Least residual of the shading as declared at which another encoding is tried, which good grey balls stay below; and how many times less
 an encoding must leave, which has no free parameter."""
+DARK_COSINE, DARK_PIXELS = -0.1, 20
+"""The cosine between light and normal below which a ball is dark, also where its direction is some degrees wrong, and the least count of
+such pixels that tell of the light there."""
 ROUNDS = 20
 """The iterations of the re-weighted least squares."""
 ENCODINGS = {"srgb_texture": "sRGB", "g22_rec709_scene": "a power of 2.2"}
@@ -102,6 +105,17 @@ def fit_brightness(
     relative = (readings / model[:, None])[:, lit] / scale[lit] - 1
     residual = math.sqrt(float((weight[:, lit] * relative**2).sum() / weight[:, lit].sum()))
     return Brightness(np.maximum(scale, 0), residual, int(usable.sum()))
+
+
+def dark_side(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, view: BallView, scale: np.ndarray
+              ) -> float | None:
+    """Return the light on the dark side of the ball, as a part of that where it faces the light; None if that side is not seen.
+    `radiance`, `saturated`, `light`, `view`: as of fit_brightness. `scale`: what fit_brightness found."""
+    incidence = view.normal @ np.array(light.direction) if isinstance(light, DistantLight) else _cosine(light, view)
+    dark = _usable(saturated, view) & (incidence < DARK_COSINE)
+    if dark.sum() < DARK_PIXELS:
+        return None
+    return float(np.median(radiance[dark].mean(axis=-1)) / (scale.mean() * received(light, view)[view.inside].max()))
 
 
 def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, view: BallView, *,

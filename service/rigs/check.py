@@ -19,8 +19,8 @@ ONE_SIDED = 0.25
 """A rig without lamps near this part of the sphere is said to leave it dark."""
 ONE_PLACE_DEGREES = 0.1
 """The angle between two lamps below which they stand in one direction, as measured places of two lamps never do."""
-FARTHEST_M = 100.0
-"""The distance of lamps from which places are said to be in another unit."""
+NEAREST_M, FARTHEST_M = 0.02, 100.0
+"""The distances of lamps below and above which places are said to be in another unit."""
 SIDE, LAMP = 720, 7
 """The side of the picture of a half of the dome, and the radius of a lamp in it, pixels."""
 
@@ -64,7 +64,7 @@ def check_rig(request: RigCheckRequest) -> RigCheck:
 
 
 def _places(rig: Rig) -> list[str]:
-    """Say which lamps with the same primaries stand in one direction, and that all stand too far to be lamps."""
+    """Say which lamps with the same primaries stand in one direction, and that all stand too far or too near to be lamps."""
     said = []
     directions, subject = rig.directions, np.array(rig.subject_m)
     near = np.arccos(np.clip(directions @ directions.T, -1, 1)) < np.radians(ONE_PLACE_DEGREES)
@@ -75,8 +75,10 @@ def _places(rig: Rig) -> list[str]:
         said.append(f"lights: {rig.lights[one].name} and {rig.lights[other].name} stand in one direction"
                     + (f", and {len(pairs) - 1} more pairs" if len(pairs) > 1 else "") + ": a place that was copied?")
     places = [lamp.position_m for lamp in rig.lights if lamp.position_m is not None]
-    if places and (distance := float(np.median(np.linalg.norm(np.array(places) - subject, axis=1)))) > FARTHEST_M:
-        said.append(f"lights[].position_m: the lamps stand {distance:.3g} m from the subject (median): are the places millimetres?")
+    distance = float(np.median(np.linalg.norm(np.array(places) - subject, axis=1))) if places else None
+    if distance is not None and not NEAREST_M <= distance <= FARTHEST_M:
+        doubt = "are the places millimetres?" if distance > FARTHEST_M else "are the places of the scene metres, and not millimetres?"
+        said.append(f"lights[].position_m: the lamps stand {distance:.3g} m from the subject (median): {doubt}")
     return said
 
 

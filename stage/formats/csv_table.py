@@ -19,20 +19,25 @@ def with_point(text: str) -> str:
 def read_table(path: Path, columns: Sequence[str]) -> "csv.DictReader[str]":
     """Return the rows of a table; the names of its columns are in lower case.
     Where semicolons or tabs part the columns, numbers may have decimal commas.
-    Raises ManifestError if the file is not UTF-8 text, or lacks one of these columns; names it. Raises StorageError if it cannot be
-    read."""
+    Raises ManifestError if the file is not UTF-8 text, lacks one of these columns, or has a line with more cells than columns; names it.
+    Raises StorageError if it cannot be read."""
     try:
         lines = inputs.read_bytes(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ManifestError(f"{path}: is not UTF-8 text") from error
-    rows = csv.DictReader(lines)
     separator = next((mark for mark in ";\t" if lines and mark in lines[0]), None)
     if separator is not None:
-        rows = csv.DictReader(_with_commas(lines, separator))
+        lines = list(_with_commas(lines, separator))
+    rows = csv.DictReader(lines)
     heads = [head.strip().lower() for head in rows.fieldnames or ()]
     if missing := [column for column in columns if column not in heads]:
         raise ManifestError(f"{path}: has no column {missing[0]}: its first line names the columns {', '.join(columns)}")
     rows.fieldnames = heads
+    cells = csv.reader(lines)
+    for row in cells:
+        if any(cell.strip() for cell in row[len(heads):]):
+            hint = ": part columns by semicolons where numbers have decimal commas" if separator is None else ""
+            raise ManifestError(f"{path}: line {cells.line_num}: has {len(row)} cells, the first line names {len(heads)} columns{hint}")
     return rows
 
 

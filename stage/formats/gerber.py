@@ -6,6 +6,7 @@ own, so that its area is that of rectangles exactly and of discs to a thousandth
 """
 
 import math
+import re
 import warnings
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -26,6 +27,8 @@ SAMPLES, MOST_SAMPLES = 128, 4096
 TURN_STEPS = 256
 """Straight lines that stand for a full circle: its area is right to 10⁻⁴."""
 MILLI = 1e-3
+END = re.compile(r"(?:^|\*%?)\s*(?:D0?2)?M0?[02]\s*\*", re.MULTILINE)
+"""The command that every Gerber file ends with: M02, and M00 in files of before 2012; P-CAD writes D02M02."""
 
 
 class Pad(NamedTuple):
@@ -111,10 +114,13 @@ def _objects(path: Path) -> list[tuple[Any, list[tuple[np.ndarray, bool]]]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about old notations, of which it says that they are old
             things = reader.from_string(text, filename=path).objects
-            return [(thing, shape) for thing in things if (shape := list(_outlines(thing)))]
+            found = [(thing, shape) for thing in things if (shape := list(_outlines(thing)))]
     except Exception as error:  # whatever a parser raises at text that is no layer
         said = (str(error) or type(error).__name__).splitlines()[0][:160]
         raise ManifestError(f"{path}: is no {kind} file that can be read: {said}") from error
+    if found and kind == "Gerber" and not END.search(text):
+        raise ManifestError(f"{path}: is truncated: it does not end with M02")
+    return found
 
 
 def _outlines(thing: Any) -> Iterator[tuple[np.ndarray, bool]]:

@@ -1,5 +1,6 @@
 """Import of stacks of projected patterns: Gray codes and phase shifts in the order that options say, and the codecs of SLStudio."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -28,6 +29,10 @@ PIXEL_CENTRE = 0.5
 """The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
 
+LEAST_BASELINE_M = 1e-4
+"""The least distance of two devices, below which their lenses would be one."""
+
+
 def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float, *,
                          second: str = "projector", extrinsics: Path | None = None) -> dict[str, Any]:
     """Return the camera and the projector of the manifest from an OpenCV calibration file.
@@ -36,6 +41,10 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
     pose_found = found if extrinsics is None else read_matrices(extrinsics)
     rotation = pick(pose_found, ROTATION, posed, "rotation R", shape=(3, 3))
     translation = pick(pose_found, TRANSLATION, posed, "translation T", shape=(3,)) * unit_m
+    baseline_m = math.hypot(*translation)
+    if baseline_m < LEAST_BASELINE_M:
+        raise ManifestError(f"{posed}: T: the {second} stands {baseline_m:.2g} m from the camera: without a baseline there is no depth: "
+                            "check T, and the unit of its numbers")
     pose = camera_from_projector(rotation, translation)
     entries = {}
     second_sizes = (PROJECTOR_SIZE,) if second == "projector" else ()  # a file of two cameras says the size of the first

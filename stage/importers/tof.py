@@ -18,6 +18,10 @@ from stage.tof.light_time import range_of_delay_m, range_of_phase_m
 
 ORDERS = ("frequency,phase", "phase,frequency")
 LEAST_BINS = 3
+MOST_TURN_M = 1e5
+"""The longest range after which the phase of a modulation repeats: 1.5 kHz, far below any camera's."""
+MOST_BIN_M = 1e3
+"""The longest bin of a histogram, 7 µs; cameras have bins below 10 m."""
 
 
 class Plane(NamedTuple):
@@ -47,6 +51,9 @@ def import_correlations(
     """Write a capture.json for correlation images of a continuous-wave camera."""
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
+    slow = next((hz for hz in frequencies_hz if range_of_phase_m(2 * pi, hz) > MOST_TURN_M), None)
+    if slow is not None:
+        raise ManifestError(f"--frequencies-hz: {slow:g} Hz repeats after {range_of_phase_m(2 * pi, slow):.3g} m: give hertz, as in 20e6")
     arrays = arrays or ArrayFiles()
     count = len(frequencies_hz) * len(phases_deg)
     names = _array_or_image_names(source, arrays)
@@ -92,6 +99,8 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.
     """
+    if range_of_delay_m(bin_s) > MOST_BIN_M:
+        raise ManifestError(f"--bin-s {bin_s:g}: bins are {range_of_delay_m(bin_s):.3g} m long: give seconds, as in 1.5e-9")
     arrays = arrays or ArrayFiles()
     folder, names = (source.parent, [source.name]) if source.is_file() else (source, arrays.names(source))
     shapes: dict[str, tuple[int, ...]] = {}

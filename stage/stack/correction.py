@@ -1,13 +1,14 @@
 """Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, colours, exposure and ambient light."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from stage.capture.capture import Capture
 from stage.capture.light import OffLight
-from stage.capture.manifest import ColorMatrix, Frame
+from stage.capture.manifest import ColorMatrix, Frame, Manifest
 from stage.colour import radiance
 from stage.colour.colour import linearise
 from stage.colour.colour_spaces import channels_apart, is_linear
@@ -19,6 +20,12 @@ FULL_SCALE = 1.0
 BRIGHTER_DARK, BRIGHTER_OFF = 0.25, 0.5
 """Parts of the mask from which on a dark image, and `off` frames, are refused that are brighter there than an image: sensors have pixels
 that glow more in one image than in another, and light of a room flickers."""
+
+
+def saturation_limit(manifest: Manifest, path: Path) -> float:
+    """Return the recorded value at and above which the readings of an image are saturated: the manifest's, else the largest of integers,
+    else infinity."""
+    return manifest.saturation if manifest.saturation is not None else FULL_SCALE if images.read_header(path).integer else np.inf
 
 
 class Radiance(NamedTuple):

@@ -1,6 +1,7 @@
 """The calibration of a time-of-flight camera, schema relit.tof/1 (noise, wiggling, offset, drift, pulse), and its fits."""
 
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -77,7 +78,11 @@ class TofCalibration(Strict):
     """True range = scale · measured - offset_m - temperature drift."""
     temperature: Temperature | None = None
     sigma_m: NotNegative | None = None
-    """The standard deviation of ranges that the calibration leaves open and all pixels share; None: it is not known."""
+    """The standard deviation of ranges near `middle_m` that the calibration leaves open and all pixels share; None: it is not known."""
+    scale_sigma: NotNegative = 0.0
+    """The standard deviation of `scale`, by which that of ranges grows away from `middle_m`."""
+    middle_m: float = 0.0
+    """The mean range of the distances from which `scale` was measured."""
     pulse_sigma_s: Positive | None = None
     """The standard deviation of a Gaussian pulse, including the jitter of the detector."""
     pulse: PulseShape | None = None
@@ -96,6 +101,10 @@ class TofCalibration(Strict):
     def of_frequency(self, modulation_hz: float) -> Harmonics | None:
         """Return the wiggling at a frequency, which must agree to 1 part in 10⁶, or None when it is unknown."""
         return next((h for h in self.harmonics if abs(h.modulation_hz - modulation_hz) <= 1e-6 * modulation_hz), None)
+
+    def sigma_at(self, range_m: float) -> float | None:
+        """Return the standard deviation of a range that the calibration leaves open; None: it is not known."""
+        return None if self.sigma_m is None else math.hypot(self.sigma_m, self.scale_sigma * (range_m - self.middle_m))
 
     def correct(self, range_m: np.ndarray, temperature_c: float | None = None) -> np.ndarray:
         """Return measured ranges in metres, corrected for scale, offset and drift.

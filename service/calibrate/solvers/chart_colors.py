@@ -254,7 +254,9 @@ def _judge(readings: PatchReadings, reference: np.ndarray, chart: ChartReference
     off = logs - terms @ plane
     refused = dict(readings.refused)
     refused |= {int(each): "too dark" for each in np.flatnonzero(~seen) if int(each) not in refused}
-    refused |= {int(each): "shadowed" if off[each] < 0 else "glaring" for each in np.flatnonzero(seen & (np.abs(off) > tolerance))}
+    brightest = int(np.where(seen, readings.value.sum(axis=1), 0).argmax())  # a reading that nothing exceeds may be cut off
+    refused |= {int(each): "glaring" if off[each] > 0 else "clipped or shadowed" if each == brightest else "shadowed"
+                for each in np.flatnonzero(seen & (np.abs(off) > tolerance))}
     fall = np.exp(terms[:, 1:3] @ plane[1:3])
     left, needed = len(index) - len(refused), int(np.ceil(LEAST_PART * len(index)))
     if left < needed:

@@ -2,10 +2,13 @@
 
 Each pixel reads ambient + s · g(level). Where the readings of groups of pixels are no such lines of the response, the readings are not
 linear in light, or the exposure was not the same in all images; pixels that the projector does not reach, and that get darker with the
-level, tell of the latter. A level whose light is not between what its neighbours suggest is an image of another level.
+level, tell of the latter. A level whose light is not between what its neighbours suggest is an image of another level; where all levels
+are a little off, the lamp or the exposure flickers. Light that no longer rises at the last levels is cut off.
 """
 
 import numpy as np
+
+from stage.spread import MAD_TO_SIGMA
 
 GROUPS = 24
 """Groups of pixels of equal brightness, whose means have little noise."""
@@ -15,6 +18,13 @@ FALLING = -0.01
 """Change of a group from the darkest to the brightest level, as a part of full scale, below which it gets darker."""
 ALONE = 0.05
 """Light by which a level differs from what the levels beside it suggest, as a part of full scale."""
+FLICKER, FLICKER_LEVELS = 0.01, 12
+"""Standard deviation of the brightness of single images, as a part of it, above which lamp or exposure flicker, and the least count of
+levels between the ends that tell of it: with so many the kinks of video make 0.4 %."""
+DARK = 0.01
+"""Readings below this part of the brightest tell of no flicker."""
+FLAT_LIGHT, FLAT_LEVELS = 0.998, 0.1
+"""Light from which on it does not rise, as a part of full scale, and the least part of the levels that have it; 0.06 are white in video."""
 MOST_SPREAD = 0.05
 """Median deviation of the pixels from the response above which it is not sure."""
 
@@ -44,6 +54,14 @@ def response_faults(levels: np.ndarray, readings: np.ndarray, curve: np.ndarray,
     if abs(alone[worst]) > ALONE:
         faults.append(f"the light of level {levels[worst]:.3g} is {abs(alone[worst]):.2g} of full scale off what the levels beside it "
                       "suggest: check that its image shows this level")
+    flicker = _flicker(alone, readings.mean(axis=1), levels, curve)
+    if flicker > FLICKER:
+        faults.append(f"images are brighter and darker by {100 * flicker:.2g} % from level to level: the lamp or the exposure flickers, "
+                      "and the response is as much off: fix the exposure, and take the mean of several images of each level")
+    flat = levels[np.flatnonzero(curve < FLAT_LIGHT)[-1] + 1]
+    if 1 - flat > FLAT_LEVELS:
+        faults.append(f"the light does not rise above level {flat:.3g}: readings saturate there, or the projector shows no more: shorten "
+                      "the exposure, or give the saturation of the camera")
     if spread > MOST_SPREAD:
         faults.append(f"pixels deviate by {spread:.2g} of full scale from the response: give brighter images, without anything that moves")
     return tuple(faults)
@@ -59,3 +77,13 @@ def _alone(levels: np.ndarray, curve: np.ndarray) -> np.ndarray:
     padded = np.concatenate([[2 * exponent[0] - exponent[1]], exponent, [2 * exponent[-1] - exponent[-2]]])
     off[inner] = curve[inner] - levels[inner] ** ((padded[:-2] + padded[2:]) / 2)
     return off
+
+
+def _flicker(alone: np.ndarray, readings: np.ndarray, levels: np.ndarray, curve: np.ndarray) -> float:
+    """Return the standard deviation of the brightness of single images, as a part of it; 0 for too few levels.
+    `alone`: what `_alone` says. `readings`: [levels] mean."""
+    told = (curve > 0) & (curve < 1) & (levels > 0) & (levels < 1) & (readings > DARK * readings[-1])
+    if told.sum() < FLICKER_LEVELS:
+        return 0.0
+    off = alone[told] * (readings[-1] - readings[0]) / readings[told]
+    return MAD_TO_SIGMA * float(np.median(np.abs(np.diff(off)))) / 5**0.5  # each holds four images, by 3/2 and 1/2, twice

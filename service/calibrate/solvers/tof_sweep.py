@@ -2,10 +2,10 @@
 which distances contradict the others.
 
 The pixels of one distance err alike, so that a fit to all pixels would be sure of anything: what the other distances say of one tells how
-far a calibration is known between its distances.
+far a calibration is known between its distances. Where in a period it is known follows from the phases that the distances show.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,12 @@ FOLLOWED = 0.1
 """Squares that a fit leaves, over those of the fits without each step, below which it follows every step."""
 SETTLED_M = 1e-3
 """Scatter of distances below which none contradicts the others."""
+PLACES = 1440
+"""Ranges at which the fit of the wiggling is judged: thirty in a period of the highest harmonic, over four periods."""
+UNKNOWN_RAD = np.pi / 3**0.5
+"""Standard deviation of a phase of which nothing is known."""
+GAP = 4.0
+"""Standard deviation at a range, over the median of all, above which no distance shows its phases; 1.2 to 3 where distances do."""
 
 
 class StepPhases(NamedTuple):
@@ -68,11 +74,6 @@ class Fit(NamedTuple):
         told = np.sum(self.left**2) > FOLLOWED * np.sum(self.left_out**2)
         return np.asarray(np.sqrt(np.maximum(self.left * self.left_out, 0)) * np.sign(self.left) * told)
 
-    @property
-    def sigma(self) -> float:
-        """The standard deviation of the fit at a step that it does not know: that by which leaving steps out moves it."""
-        return float(np.sqrt(max(np.mean(self.left_out * (self.left_out - self.left)), 0.0)))
-
 
 def fit_steps(matrices: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Fit:
     """Fit matrices [n, unknowns] of steps to their readings [n] by least squares, and without each step in turn."""
@@ -96,6 +97,53 @@ def fit_wiggling(steps: Sequence[StepPhases], modulation_hz: float) -> Fit:
     """Fit the harmonics of one frequency to phases that were measured at known distances, in radians, as `fit_harmonics` does to all at
     once."""
     return fit_steps([harmonic_terms(step.phase) for step in steps], _errors(steps, modulation_hz))
+
+
+class WigglingSigma(NamedTuple):
+    """How far ranges are known from the nearest to the farthest distance of a sweep, and over the rest of a period of its highest
+    frequency."""
+
+    range_m: np.ndarray  # [PLACES]
+    sigma_m: np.ndarray  # [PLACES] standard deviations that the fitted wiggling leaves
+    reached: np.ndarray  # [PLACES] bool, not beyond the farthest distance
+
+    @property
+    def most_m(self) -> float:
+        """Return the largest standard deviation from the nearest to the farthest distance."""
+        return float(self.sigma_m[self.reached].max())
+
+    @property
+    def unseen(self) -> int | None:
+        """Return the place that is known least, where no distance shows its phases; None if the distances show all."""
+        worst = int(self.sigma_m.argmax())
+        return worst if self.sigma_m[worst] > GAP * np.median(self.sigma_m[self.reached]) else None
+
+
+def wiggling_sigma(phases: Mapping[float, Sequence[StepPhases]]) -> WigglingSigma:
+    """Return how far what `fit_wiggling` finds at each frequency leaves ranges open, whose phases are equally sure at all of them.
+    `phases`: the steps at each frequency in hertz."""
+    ranges = [float(np.median(step.range_m)) for steps in phases.values() for step in steps]
+    nearest, farthest = min(ranges), max(ranges)
+    range_m = np.linspace(nearest, max(farthest, nearest + SPEED_OF_LIGHT / (2 * max(phases))), PLACES)
+    weights = {hz: hz**2 / sum(each**2 for each in phases) for hz in phases}
+    sigma_m = sum(weight * _sigma_at(range_m, phases[hz], hz) for hz, weight in weights.items())  # missed distances err in all alike
+    return WigglingSigma(range_m, np.asarray(sigma_m), range_m <= farthest)
+
+
+def _sigma_at(range_m: np.ndarray, steps: Sequence[StepPhases], modulation_hz: float) -> np.ndarray:
+    """Return the standard deviations of ranges [n] by one frequency: those of least squares on readings of which those of one step err
+    alike, and each by itself beside that."""
+    terms, errors = [harmonic_terms(step.phase) for step in steps], _errors(steps, modulation_hz)
+    fit = fit_wiggling(steps, modulation_hz)
+    own = np.concatenate([error - matrix @ fit.values - left for matrix, error, left in zip(terms, errors, fit.left, strict=True)])
+    alike_variance = float(np.maximum(fit.left * fit.left_out, 0).mean())
+    scales, axes = np.linalg.eigh(sum(matrix.T @ matrix for matrix in terms))
+    inverse = axes / np.maximum(scales, LEAST_TERM**2 * scales[-1]) @ axes.T
+    per_metre = 4 * np.pi * modulation_hz / SPEED_OF_LIGHT
+    at = harmonic_terms(range_m * per_metre + np.concatenate(errors).mean())
+    alike = at @ inverse @ np.column_stack([matrix.sum(axis=0) for matrix in terms])
+    variance = alike_variance * (alike**2).sum(axis=1) + own.var() * ((at @ inverse) * at).sum(axis=1)
+    return np.asarray(np.minimum(np.sqrt(variance), UNKNOWN_RAD)) / per_metre
 
 
 class TargetFaults(NamedTuple):

@@ -70,8 +70,10 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         found = solve_correlations(correlations, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit, usable=mask,
                                    device=device)
     found = _scattered(_corrected(found, options, calibration, path, near_m, far_m), mask)
-    if calibration.sigma_m is not None:
-        found = replace(found, facts=found.facts | {"calibration_sigma_m": calibration.sigma_m})
+    solved = np.isin(found.status, SOLVED) & mask.reshape(-1)
+    shared = calibration.sigma_at(float(np.median(found.range_m[solved])) if solved.any() else calibration.middle_m)
+    if shared is not None:
+        found = replace(found, facts=found.facts | {"calibration_sigma_m": float(f"{shared:.3g}")})
     return _depth_of(found, options, capture.camera, mask, device=device, timings=timings)
 
 

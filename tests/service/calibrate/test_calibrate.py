@@ -171,6 +171,21 @@ def test_grey_ball_writes_irradiance(relit, tmp_path):
     assert Capture.open(folder).manifest.irradiance_scale == "relative"
 
 
+@pytest.mark.parametrize("refined", [[], ["--refine-direction"]])
+@pytest.mark.parametrize(("ambient", "said"), [(0.0, False), (0.001, False), (0.02, True)])
+def test_light_of_the_room_is_told_by_the_dark_side_of_a_ball(relit, tmp_path, refined, ambient, said):
+    """The brightest normals read 0.16 under the dimmest light: two hundredths are 12 % of that, and turn directions by degrees."""
+    lights = [{**PLACEHOLDER, "direction": direction} for direction in DIRECTIONS.tolist()]
+    folder = write(tmp_path / "ball", [image + np.float32(ambient) for image in grey_images()], lights)
+    outcome = relit.done("calibrate", "grey-ball", folder, "--ball", CIRCLE, *refined)
+    assert ("the dark side of the ball has" in outcome.out) == said, outcome.out
+    assert (max(light["dark_side"] or 0 for light in report_of(folder, "grey-ball")["lights"]) > 0.05) == said
+    write_exr(folder / "off.exr", np.full((HEIGHT, WIDTH, 3), ambient))
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    edit_manifest(folder, frames=[*frames, {"image": "off.exr", "light": {"type": "off"}}])
+    assert "the dark side" not in relit.done("calibrate", "grey-ball", folder, "--ball", CIRCLE, *refined).out
+
+
 def test_a_ball_behind_an_analyser_shows_half_of_the_irradiance(relit, tmp_path):
     """Of a crossed and of a parallel one alike, because a matt ball keeps no polarisation; each frame keeps what it says of it."""
     lights = [{**PLACEHOLDER, "direction": direction.tolist(), "polarization": kind} for direction in DIRECTIONS
@@ -271,6 +286,8 @@ BAD = {
     "albedo": (["grey-ball", *BALL, "--albedo", "0.5,0.5"], {}, "--albedo 0.5,0.5: give one number or three"),
     "radii": (["light-positions", *BALL, *BALL, *BALL, "--ball-radius-m", "0.1", "--ball-radius-m", "0.1"], {},
               "--ball-radius-m: is given 2 times for 3 balls"),
+    "radius in millimetres": (["light-positions", *BALL, "--ball", "20,20,10", "--ball-radius-m", "30"], {},
+                              "--ball-radius-m: is 30, and no calibration ball has a radius of 30 m: give it in metres"),
     "radius against scale": (["light-positions", *BALL, *BALL, "--ball-radius-m", "0.1"], {},
                              "it ball 1 has a radius of 0.03 m, --ball-radius-m says 0.1"),
     "no scale": (["light-positions", *BALL, *BALL, "--ball-radius-m", "0.03"],

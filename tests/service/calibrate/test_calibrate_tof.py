@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.calibrate.tof import calibrate_tof
+from service.errors import RequestError
 from service.requests.calibrate import TofCalibrationRequest
 from stage.capture.camera import Camera
 from stage.errors import StageError
@@ -47,7 +48,7 @@ def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
     assert "wiggling at 80 MHz" in outcome.out and "before" in outcome.out
     calibration = read_calibration(tmp_path / "camera.json")
     assert calibration.temperature is not None
-    assert calibration.temperature.metres_per_c == pytest.approx(1e-3, rel=0.05)
+    assert calibration.temperature.metres_per_c == pytest.approx(1e-3, rel=0.05) and calibration.sigma_m < 5e-4
     folder = write(tmp_path / "new", cw(wall(3.3, 0.04 + 1e-3 * 15)), camera=CAMERA)
     _, maps, _ = run(folder, calibration=tmp_path / "camera.json", temperature_c=40.0)
     assert maps.mask.mean() > 0.99
@@ -109,6 +110,40 @@ def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
     plan["steps"][2]["depth_m"] += 0.2
     path.write_text(json.dumps(plan))
     assert "d2" in calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu")).warnings[0]
+    path.write_text(json.dumps({**plan, "steps": [{**step, "depth_m": step["depth_m"] / 0.3048} for step in plan["steps"]]}))
+    with pytest.raises(RequestError, match=r"depth_m grows by 3.2\d m for each metre of the measured ranges: check depth_m, its unit"):
+        calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
+
+
+@pytest.mark.long
+def test_sigma_of_a_pulsed_sweep_grows_away_from_its_distances(tmp_path):
+    """Six distances within 30 cm tell little of a wall at 6.3 m: it was ten standard deviations off."""
+    count = iter(range(100))
+
+    def pulsed(view):
+        return pulsed_frames(tof.histogram(view, 1e6, seed=next(count)))
+
+    path = sweep(tmp_path, [(f"d{k}", depth, 0.05, None) for k, depth in enumerate(np.linspace(3, 3.3, 6))], pulsed)
+    found = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu")).calibration
+    assert 3.0 < found.middle_m < 3.8 and found.sigma_m < 3e-4  # slanting rays; noise of a distance is .1 mm
+    folder = write(tmp_path / "far", pulsed(wall(6.3, 0.05)), camera=CAMERA)
+    _, maps, said = run(folder, calibration=tmp_path / "c.json")
+    sigma = said["found"]["calibration_sigma_m"]
+    assert sigma > 3 * found.sigma_m and abs(np.median(maps.depth[maps.mask]) - 6.3) < 4 * sigma
+
+
+@pytest.mark.long
+def test_sigma_holds_a_drift_that_is_no_line(tmp_path):
+    """The drift bends by up to 12 mm, which the line through it misses by some millimetres at all temperatures."""
+    warm = (15.0, 20.0, 30.0, 35.0, 45.0)
+    steps = [(f"d{k}", depth, 0.04, 25.0) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))]
+    steps += [(f"w{k}", 2.0 + k, 0.04 + 1e-3 * (c - 25) + 3e-5 * (c - 25) ** 2, c) for k, c in enumerate(warm)]
+    path = sweep(tmp_path, steps, cw)
+    found = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu")).calibration
+    assert 5e-4 < found.sigma_m < 5e-3
+    folder = write(tmp_path / "new", cw(wall(3.3, 0.04)), camera=CAMERA)
+    _, maps, _ = run(folder, calibration=tmp_path / "c.json", temperature_c=25.0)
+    assert abs(np.median(maps.depth[maps.mask]) - 3.3) < 3 * found.sigma_m
 
 
 @pytest.mark.parametrize(("steps", "message"), [

@@ -156,6 +156,14 @@ def test_patches_that_are_clipped_shadowed_or_glaring_are_left_out_by_name(relit
     assert left_out == {"white": "clipped", "green": "glaring", "black": "glaring", "purplish blue": "shadowed"}
 
 
+@pytest.mark.long
+def test_a_bright_patch_that_is_too_dark_may_be_clipped(relit, tmp_path):
+    """A quarter of the light of white is cut off, at a level that nothing declares."""
+    pixels = np.minimum(noisy(stain(picture(seen(), Pose(distance=700)), {8: -0.035}), noise=0.002), 0.33)
+    told = relit.done("calibrate", "chart", shoot(tmp_path / "cap", [pixels])).out
+    assert "patch 19 (white) is clipped or shadowed, and left out" in told and "patch 8 (purplish blue) is shadowed, and left out" in told
+
+
 def half_shadow(shown, part, axis):
     middle = shown.corners.mean(axis=0)
     v, u = np.mgrid[: shown.pixels.shape[0], : shown.pixels.shape[1]]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from service.calibrate.response import fit_response
-from service.calibrate.sensor import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
+from service.calibrate.sensor import make_flat, mean_image, recorded_values
 from service.calibrate.solvers.card_faults import card_faults
+from service.calibrate.solvers.saturation_level import ChannelSaturation, ReadingHistogram, capture_saturation
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr
@@ -90,6 +91,24 @@ def test_cards_that_are_refused(folder):
         make_flat(grey, mean_image(images(folder, "d", [np.full((SIZE, SIZE, 3), 0.2)]), capture), capture)
 
 
+def test_a_clipped_white_card_is_refused_where_the_manifest_says_no_saturation(relit, folder):
+    """The largest integer is clipped; a card below it, or one in floating point, is not."""
+    levels = np.linspace(200, 400, SIZE * SIZE).reshape(SIZE, SIZE, 1) * np.ones(3)
+    card = write_image(folder.parent / "card.png", np.uint8(np.minimum(levels, 255)))
+    count = (levels[..., 0][Capture.open(folder).mask()] >= 255).sum()
+    assert f"card.png: {count} pixels are at or above the saturation of 1" in relit.refused("calibrate", "flat-field", folder, card)
+    relit.done("calibrate", "flat-field", folder, write_image(folder.parent / "darker.png", np.uint8(levels * 0.6)))
+    relit.done("calibrate", "flat-field", folder, write_exr(folder.parent / "card.exr", levels / 100))
+
+
+def test_a_card_above_the_saturation_of_the_manifest_gives_no_white_balance(relit, folder):
+    """Fourteen bits in sixteen end at a quarter of full scale, where every colour becomes grey."""
+    edit_manifest(folder, saturation=0.249)
+    card = write_exr(folder.parent / "card.exr", np.minimum(np.ones((SIZE, SIZE, 3)) * (0.4, 0.3, 0.2), 0.25))
+    assert f"card.exr: {SIZE * SIZE} pixels of the card are saturated" in relit.refused("calibrate", "white-balance", folder, card)
+    relit.done("calibrate", "white-balance", folder, write_exr(folder.parent / "card2.exr", np.ones((SIZE, SIZE, 3)) * (0.2, 0.15, 0.1)))
+
+
 def test_a_dark_image_with_light_in_it_is_refused(relit, tmp_path):
     folder = write_capture(tmp_path / "cap", make_scene(32, 3))
     before = (folder / "capture.json").read_bytes()
@@ -125,21 +144,40 @@ def test_a_region_with_more_than_the_card_is_said(relit, tmp_path):
     assert "colours in it differ" in relit.done("calibrate", "white-balance", folder, write_exr(tmp_path / "half.exr", card)).out
 
 
-def pile(values, peak=None):
-    top = TopHistogram(float(values.max() if peak is None else peak))
-    for part in np.array_split(values, 3):
-        top.add(part)
-    return top.saturation()
+def pile(*images):
+    histogram = ReadingHistogram(float(max(image.max() for image in images)))
+    for image in images:
+        histogram.add(image)
+    return histogram.saturation()
 
 
 def test_a_pile_at_the_top():
     rng = np.random.default_rng(2)
-    light = rng.exponential(0.4, 20_000)
-    found = pile(np.minimum(light, 0.8) + 0.001 * rng.standard_normal(20_000))
-    assert found.level == pytest.approx(0.8, rel=0.02) and found.readings > 2000
-    assert pile(light) == ChannelSaturation(None, 0)
-    assert pile(rng.uniform(0, 1, 20_000)) == ChannelSaturation(None, 0)  # a flat histogram is no pile
+    light = rng.exponential(0.4, (3, 7_000))
+    found = pile(*np.minimum(light, 0.8))
+    assert found.level == pytest.approx(0.792) and found.readings == (light >= 0.792).sum()
+    assert pile(*light) == ChannelSaturation(None, 0)
+    assert pile(*rng.uniform(0, 1, (3, 7_000))) == ChannelSaturation(None, 0)  # a flat histogram is no pile
     assert pile(np.zeros(100)) == ChannelSaturation(None, 0)
+    hot = np.where(rng.random(light.shape) < 0.001, 0.95, np.minimum(light, 0.8))
+    assert pile(*hot).level == pytest.approx(0.792, rel=1e-4)  # told apart to 1.5e-5 of the largest value
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_bright_things_are_no_pile(bits):
+    """Spheres without noise, of which eight bits have few codes, and half an image at one brightness, with the noise of 60 000 electrons
+    or with another one in each image."""
+    rng, codes = np.random.default_rng(3), 2**bits - 1
+    y, x = np.mgrid[-1:1:121j, -1:1:121j]
+    sphere = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    for peak in (0.1, 0.35, 0.8):
+        spheres = [np.rint(codes * sphere * light) / codes for light in (0.7 * peak, 0.9 * peak, peak)]
+        assert pile(*spheres) == ChannelSaturation(None, 0)
+        backs = [np.where(x > 0, light, ball) for light, ball in zip((0.5, 0.55, 0.6), spheres, strict=True)]
+        assert pile(*(np.rint(codes * back) / codes for back in backs)) == ChannelSaturation(None, 0)
+        noisy = [np.where(x > 0, 0.6, ball) + 0.004 * rng.standard_normal(x.shape) for ball in spheres]
+        assert pile(*(np.rint(codes * np.maximum(back, 0)) / codes for back in noisy)) == ChannelSaturation(None, 0)
+        assert pile(*(np.minimum(ball, 0.6 * peak) for ball in spheres)).level == pytest.approx(0.594 * peak, rel=1e-4)
 
 
 def test_the_least_level_stands_for_all_channels():
@@ -257,6 +295,24 @@ def test_images_that_contradict_the_response_are_said(change, words):
     images = change(0.05 + scale * (levels**2.2)[:, None] + RNG.normal(0, 0.002, (9, 2200))).astype(np.float32)
     found = fit_response(levels, images)
     assert (found.faults == ()) if words is None else any(words in fault for fault in found.faults), found.faults
+
+
+def video(levels):
+    return np.clip((255 * levels - 16) / 219, 0, 1) ** 2.2
+
+
+@pytest.mark.parametrize(("light", "words"), [
+    (lambda levels: levels**2.2, None),
+    (video, None),
+    (lambda levels: levels * levels * (3 - 2 * levels), None),
+    (lambda levels: np.minimum(levels**2.2, 0.65), "does not rise above level 0.875"),
+    (lambda levels: levels**2.2 * (1 + 0.03 * np.random.default_rng(5).standard_normal(levels.size)), "% from level to level"),
+], ids=["power", "black and white of video", "S", "clipped", "flicker"])
+def test_an_even_wall_tells_of_clipped_and_of_flickering_light(light, words):
+    levels = np.linspace(0, 1, 17)
+    images = 0.3 * light(levels)[:, None] + RNG.normal(0, 0.001, (17, 2000))
+    faults = fit_response(levels, images.astype(np.float32)).faults
+    assert (faults == ()) if words is None else any(words in fault for fault in faults), faults
 
 
 def test_readings_at_full_scale_of_an_image_take_no_part(relit, tmp_path):

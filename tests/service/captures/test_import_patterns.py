@@ -285,3 +285,16 @@ def test_pairs_that_are_none(relit, tmp_path, left, right, message):
     before = files_in(tmp_path)
     relit("import", "stereo", (tmp_path / left[0]).parent, (tmp_path / right[0]).parent, "--calibration", rig).refused(message)
     assert files_in(tmp_path) == before
+
+
+@pytest.mark.parametrize("unit", ["0.001", "1e-9"], ids=["no translation", "a wrong unit"])
+def test_two_cameras_in_one_place_are_refused(relit, tmp_path, unit):
+    for name in ("a", "b"):
+        write_image(tmp_path / name / "0.png", np.zeros((stereo.CAMERA.height, stereo.CAMERA.width), np.uint8))
+    pose = stereo.POSE.copy()
+    if unit == "0.001":
+        pose[:3, 3] = 0
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, stereo.OTHER), pose=pose)
+    before, words = files_in(tmp_path), ("import", "stereo", tmp_path / "a", tmp_path / "b", "--calibration", rig, "--unit-m")
+    relit(*words, unit).refused("rig.yml: T: the second camera stands")
+    assert files_in(tmp_path) == before

@@ -157,6 +157,17 @@ def test_faults_of_histograms(relit, tmp_path, values, words, message):
     assert files_in(tmp_path) == {source.name}
 
 
+def test_megahertz_and_nanoseconds_in_place_of_hertz_and_seconds_are_refused(relit, tmp_path):
+    (tmp_path / "cw").mkdir()
+    np.save(tmp_path / "cw" / "frames.npy", np.ones((4, 8, 9)))
+    relit("import", "tof", tmp_path / "cw", "--frequencies-hz", "20", *QUARTERS, "--signal", "minus", "--planes", "first").refused(
+        "--frequencies-hz: 20 Hz repeats after 7.49e+06 m: give hertz")
+    np.save(tmp_path / "h.npy", np.ones((4, 4, 64), np.int32))
+    relit("import", "histogram", tmp_path, "--bin-s", "1.5").refused("--bin-s 1.5: bins are 2.25e+08 m long: give seconds")
+    assert files_in(tmp_path) == {"cw/frames.npy", "h.npy"}
+    relit("import", "histogram", tmp_path, "--bin-s", "1.5e-6").well()  # 225 m, as of a lidar in the air
+
+
 def kinect_packet(readings):
     """A depth packet of [9, 424, 512] readings, written from libfreenect2's order: eleven companded bits, a tenth image of zeros."""
     steps = np.repeat([1, 1, 2, 4, 8, 16, 32, 64], 128)

@@ -108,7 +108,10 @@ BOTH = [*phases(), *phases(axis="row"), BLACK]
     ([*phases(), BLACK], 2.2, {}, "of their amplitude off a sinusoid"),
     (BOTH, 1.0, {2: 1.3}, "of their amplitude off a sinusoid"),
     ([*phases(steps=3), *phases(axis="row", steps=3), BLACK], 1.0, {0: 1.2, 1: 1.2, 2: 1.2}, "of columns and of rows differs by 18 %"),
-], ids=["right", "gamma", "a frame brighter", "columns brighter"])
+    ([*phases(steps=3), BLACK, WHITE], 1.0, {}, None),
+    ([*phases(steps=3), BLACK, WHITE], 1.0, {0: 1.05, 1: 0.97}, "in some places of the wave than in others, by 2"),
+    ([*phases(steps=3), BLACK, WHITE], 1.0, {3: 1.02, 4: 1.05}, None),
+], ids=["right", "gamma", "a frame brighter", "columns brighter", "three shifts", "one of three shifts brighter", "white brighter"])
 def test_waves_that_are_none_are_said(relit, tmp_path, patterns, gamma, factors, words):
     write(tmp_path, patterns, gamma=gamma, ambient=0.02)
     random = np.random.default_rng(5)
@@ -118,6 +121,12 @@ def test_waves_that_are_none_are_said(relit, tmp_path, patterns, gamma, factors,
         write_exr(tmp_path / f"{number}.exr", pixels + random.normal(0, 0.002, pixels.shape))
     warnings = solve(relit, tmp_path)[4].get("warnings", [])
     assert (warnings == []) if words is None else any(words in sentence for sentence in warnings), warnings
+
+
+def test_a_copy_of_a_frame_is_named(relit, tmp_path):
+    write(tmp_path, phases(steps=3))
+    (tmp_path / "2.exr").write_bytes((tmp_path / "1.exr").read_bytes())
+    assert "2.exr is an exact copy of 1.exr" in relit.refused("separate", tmp_path, "--out", tmp_path / "out", "--device", "cpu")
 
 
 def test_the_black_level_of_the_paper(relit, tmp_path):

@@ -64,6 +64,7 @@ def test_a_rig_is_made_of_a_table(relit, tmp_path):
     ("name,x,y,z,channel\nA,0,0,1,3\n", "universe"),
     ("name,x,y,z\nA,0,0,1\nA,0,1,1\n", "lights[1].name"),
     ("name,x,y,z\n", "lights"),
+    ("name,x,y,z\nA,0,0,1\nB,0,6,0,0,8\n", "line 3: has 6 cells, the first line names 4 columns"),
 ])
 def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
     (tmp_path / "dome.csv").write_text(text)
@@ -72,9 +73,10 @@ def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
     assert not (tmp_path / "rig.json").exists()
 
 
-@pytest.mark.parametrize("table", ["name;x;y;z\nA;0;0;1\nB;0,6;0;0,8\n", "Name\tX\tY\tZ\nA\t0\t0\t1\nB\t0.6\t0\t0.8\n"],
-                         ids=["semicolons", "tabs"])
-def test_a_table_may_have_decimal_commas(relit, tmp_path, table):
+@pytest.mark.parametrize("table", ["name;x;y;z\nA;0;0;1\nB;0,6;0;0,8\n", "Name\tX\tY\tZ\nA\t0\t0\t1\nB\t0.6\t0\t0.8\n",
+                                   "name,x,y,z\nA,0,0,1,,\n\nB,0.6,0,0.8, \n"],
+                         ids=["semicolons", "tabs", "empty cells behind the columns"])
+def test_a_table_may_have_decimal_commas_or_empty_cells(relit, tmp_path, table):
     (tmp_path / "dome.csv").write_text(table)
     relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json")
     assert json.loads((tmp_path / "rig.json").read_text())["lights"][1]["direction"] == pytest.approx([0.6, 0, 0.8])
@@ -85,6 +87,17 @@ def test_lamps_of_one_place_and_places_in_millimetres_are_said(relit, tmp_path):
     relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json", "--places")
     shown = relit.done("rig", "check", tmp_path / "rig.json").out
     assert "B and C stand in one direction" in shown and "lights[].position_m: the lamps stand 1.5e+03 m" in shown
+
+
+@pytest.mark.parametrize(("unit", "said"), [(1, True), (1000, False)], ids=["metres", "millimetres"])
+def test_a_scene_in_metres_is_said(relit, tmp_path, unit, said):
+    """Places of MVR are millimetres."""
+    places = [f"{2 * unit},{3 * unit},{4 * unit}", f"{-2 * unit},{3 * unit},{4 * unit}"]
+    (tmp_path / "scene.mvr").write_bytes(mvr("".join(fixture(f"L{at}", "Par", "RGB 8 bit", place, 1 + 9 * at) for at, place
+                                                     in enumerate(places)), Par=RGB))
+    relit.done("rig", "from-mvr", tmp_path / "scene.mvr", "--out", tmp_path / "rig.json")
+    shown = relit.done("rig", "check", tmp_path / "rig.json").out
+    assert ("the lamps stand 0.00539 m from the subject (median): are the places of the scene metres" in shown) == said
 
 
 def test_more_lamps_plan_a_smaller_error(relit, tmp_path):

@@ -87,10 +87,18 @@ def test_names_of_the_layer_count_before_those_of_the_table(tmp_path):
     assert names_of(read_pads(tmp_path / "paste.gbr"), []) == ["R7.2", "R7.2 (2)", "R8.1"]
 
 
+@pytest.mark.parametrize("end", ["M02*\n", "M02*", "M00*\n", "G54D10*M2*\n", "D02M02*\n", "%TD*%M02*\r\n", "M02*\nG04 seen*\n"])
+def test_ends_that_programs_write_are_ends(tmp_path, end):
+    (tmp_path / "paste.gbr").write_text(HEAD + "%ADD10R,0.4X0.2*%\n" + FLASH + end)
+    assert len(read_pads(tmp_path / "paste.gbr")) == 1
+
+
 @pytest.mark.parametrize(("text", "words"), [
     ("hello\n", "is a layer without an opening"),
     (HEAD + "M02*\n", "is a layer without an opening"),
     (HEAD + "D17*\nX0Y0D03*\nM02*\n", "is no Gerber file that can be read"),
+    (HEAD + "%ADD10R,0.4X0.2*%\n" + FLASH, "paste.gbr: is truncated: it does not end with M02"),
+    (HEAD + "%ADD10R,0.4X0.2*%\n" + FLASH + "G04 the end is M02*\n", "paste.gbr: is truncated"),
 ])
 def test_what_is_no_layer_is_one_sentence(tmp_path, text, words):
     (tmp_path / "paste.gbr").write_text(text)
