@@ -15,6 +15,7 @@ import numpy as np
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
 from service.calibrate.solvers.bundle import Certainty, Sight, adjust, alone
 from service.calibrate.solvers.charuco import charuco_of, find_board
+from service.calibrate.solvers.contradictions import contradiction
 from service.calibrate.solvers.procam import LEAST_VIEWS, Lens, board_points, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
@@ -83,12 +84,13 @@ def calibrate(frames: Sequence[BoardFrame], cameras: Sequence[tuple[str, Resolut
     found = adjust([sight for own in sights for sight in own], devices)
     lenses = [lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True)]
     errors = {(sight.device, sight.view): float(error) for sight, error in zip(found.sights, found.errors_px, strict=True)}
+    said = contradiction(found, [name for name, _ in cameras], [frame.name for frame in frames])
     others = []
     for device, (name, _) in enumerate(cameras[1:], start=1):
         both = [sight.view for sight in sights[device] if sight.view in firsts]
         pairs = [(frames[view].name, errors[0, view], errors[device, view]) for view in both]
         rms = found.rms_px([sight.device in (0, device) and sight.view in both for sight in found.sights])
-        others.append(OtherCalibration(lenses[device], found.pose(device), rms, found.certainty(device, name), pairs))
+        others.append(OtherCalibration(lenses[device], found.pose(device), rms, found.certainty(device, name, said), pairs))
     return lenses[0], others
 
 

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from service.calibrate.solvers.bundle import Certainty, Pinhole, Sight, adjust, alone
+from service.calibrate.solvers.contradictions import contradiction
 from stage.capture.camera import Distortion
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import distortion_of
@@ -145,7 +146,8 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     found = adjust([*sights[0], *sights[1]], devices)
     camera, projector = (lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True))
     errors, lit = found.errors_px.reshape(2, len(views))
-    return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector"))
+    said = contradiction(found, ("the camera", "the projector"), [view.name for view in views])
+    return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector", said))
 
 
 def outliers(found: ProCam) -> np.ndarray:
