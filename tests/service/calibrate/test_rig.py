@@ -252,7 +252,8 @@ def test_copies_and_encoded_images_are_said(relit, tmp_path):
     relit.done(*command)
     report = json.loads((tmp_path / "calibration.json").read_text())["rig"]
     assert report["flagged"] == 0
-    (tmp_path / "two.csv").write_text("\n".join(["frame,light,primary,level", "4,L000,red,0.75", "9,L000,red,1"]))  # frame 9 shows green
+    (tmp_path / "two.csv").write_text("\n".join(["frame,light,primary,level", "1,L000,red,0", "4,L000,red,0.75",
+                                                    "9,L000,red,1"]))  # frame 9 shows green
     relit.done("calibrate", "rig", capture, rig, "--table", tmp_path / "two.csv", *ask)
     report = json.loads((tmp_path / "calibration.json").read_text())["rig"]
     assert any("its colour changes with the level" in flag for flag in report["primaries"][0]["flags"])
