@@ -150,6 +150,13 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector", said))
 
 
+def first_alike(views: Sequence[Sequence[np.ndarray | str]]) -> list[int]:
+    """Return of each view the first view with exactly the same corners, which is itself but for copies: noise is never the same twice.
+    `views`: corners [corners, 2] as each device sees them, or why it sees none."""
+    keys = [tuple(corners if isinstance(corners, str) else corners.tobytes() for corners in view) for view in views]
+    return [keys.index(key) for key in keys]
+
+
 def outliers(found: ProCam) -> np.ndarray:
     """Return [views] bool, True for views whose error is far above that of the others."""
     worst = np.maximum(found.camera_error_px, found.projector_error_px)

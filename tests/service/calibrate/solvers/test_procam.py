@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.calibrate import stereo
-from service.calibrate.solvers.procam import BoardView, board_points, calibrate, find_corners, outliers, projector_corners
+from service.calibrate.solvers.procam import BoardView, board_points, calibrate, find_corners, first_alike, outliers, projector_corners
 from service.calibrate.stereo import BoardFrame
 from stage.capture.camera import Camera
 from stage.capture.projector import Projector
@@ -77,6 +77,13 @@ def test_noisy_corners_and_an_outlier_that_is_named():
 def test_views_with_some_corners_only():
     given = [view._replace(camera=view.camera[:40], projector=view.projector[:40], kept=view.kept[:40]) for view in views(6)]
     check(calibrate(given, BOARD, SQUARE, (400, 300), (800, 600)), 1e-3, 1e-3, 0.1)
+
+
+def test_copies_of_views_are_told():
+    given = list(views(3, noise=0.1))
+    seen = [(view.camera, view.projector) for view in given]
+    assert first_alike(seen) == [0, 1, 2] and first_alike([*seen, seen[1], (seen[0][0], seen[1][1])]) == [0, 1, 2, 1, 4]
+    assert first_alike([("hidden", seen[0][1]), (seen[0][0], "hidden"), ("hidden", seen[0][1])]) == [0, 1, 0]
 
 
 def test_too_few_views_are_refused():
