@@ -42,8 +42,6 @@ from stage.stack.correction import Correction, Radiance
 
 COLUMNS = ("frame", "light", "primary", "level")
 CHART_FILE = "chart.json"
-COLOUR_CHANGE = 0.05
-"""What one colour for all levels leaves of the readings, from here on flagged: halogen lamps redden as they are dimmed."""
 GLOSS = 0.1
 """A misfit of Lambert's law from here on is flagged."""
 
@@ -109,7 +107,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
     timings.stage("frames", sum(map(len, sweep.shots.values())))
     ambient = _ambient(correction, sweep.dark, target.box)
     found: dict[int, MeasuredPrimary | CalibrationError] = {}
-    shading: dict[int, tuple[float, str | None]] = {}
+    shading: dict[int, tuple[float, list[str]]] = {}
     patches: dict[int, np.ndarray] = {}
     done = 0
     for column, shots in sweep.shots.items():
@@ -130,7 +128,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
     measured = {column: each for column, each in found.items() if isinstance(each, MeasuredPrimary)}
     factor = _scale(request, measured)
     result = _with_measured(rig, measured, factor, space)
-    entries = [_entry(rig, column, found[column], factor, *shading.get(column, (0.0, None)), sweep.shots[column]) for column in found]
+    entries = [_entry(rig, column, found[column], factor, *shading.get(column, (0.0, [])), sweep.shots[column]) for column in found]
     timings.close()
     flagged = sum(bool(entry["flags"]) for entry in entries)
     report = write_report("rig", request, request.out.parent, {
@@ -245,8 +243,8 @@ def _ambient(correction: Correction, dark: Sequence[Frame], box: tuple[slice, sl
 
 
 def _measure(shots: list[Shot], correction: Correction, target: Target, ambient: np.ndarray | float,
-             direction: np.ndarray, declared: str) -> tuple[MeasuredPrimary, tuple[float, str | None]]:
-    """Return a primary, and what its brightest image leaves of the model of the target and says of the declared colour space."""
+             direction: np.ndarray, declared: str) -> tuple[MeasuredPrimary, tuple[float, list[str]]]:
+    """Return a primary, and what its brightest image leaves of the model of the target with what its images say that is flagged."""
     if max(shot.drive for shot in shots) < 1:
         raise CalibrationError("the table has no frame of it at level 1, full level")
     shots = sorted(shots, key=lambda shot: -shot.drive)
@@ -268,10 +266,11 @@ def _measure(shots: list[Shot], correction: Correction, target: Target, ambient:
         sigmas.append(reading.sigma)
         pixels.append(seen.tobytes())
     assert template is not None
-    check_images([shot.frame.image for shot in shots], [shot.drive for shot in shots], pixels, np.array(values), np.array(sigmas))
+    colour = check_images([shot.frame.image for shot in shots], [shot.drive for shot in shots], pixels, np.array(values), np.array(sigmas))
     found = fit_primary(np.array([shot.drive for shot in shots]), np.array(values), np.array(sigmas))
     # what the target's shading misses is an error of the model, which does not average out
-    return found._replace(sigma=np.hypot(found.sigma, template.misfit * found.irradiance)), (template.misfit, encoding)
+    found = found._replace(sigma=np.hypot(found.sigma, template.misfit * found.irradiance))
+    return found, (template.misfit, [flag for flag in (encoding, colour) if flag])
 
 
 def _read_patches(shots: list[Shot], correction: Correction, chart: ChartPatches, ambient: np.ndarray | float, direction: np.ndarray,
@@ -332,14 +331,12 @@ def _with_measured(rig: Rig, measured: dict[int, MeasuredPrimary], factor: np.nd
 
 
 def _entry(rig: Rig, column: int, found: MeasuredPrimary | CalibrationError, factor: np.ndarray, misfit: float,
-           encoding: str | None, shots: list[Shot]) -> dict[str, Any]:
+           said: Sequence[str], shots: list[Shot]) -> dict[str, Any]:
     index, primary = rig.emitters[column]
     named = {"light": rig.lights[index].name, "primary": primary.name, "images": [shot.frame.image for shot in shots]}
     if isinstance(found, CalibrationError):
         return {**named, "left": str(found), "flags": ["left as it was"]}
-    flags = [encoding] if encoding else [f"the target misses Lambert's law by {misfit:.0%}"] if misfit > GLOSS else []
-    if found.residual > COLOUR_CHANGE:
-        flags.append(f"its colour changes with the level, by {found.residual:.0%} of the brightest reading")
+    flags = [*said, *([f"the target misses Lambert's law by {misfit:.0%}"] if misfit > GLOSS else [])]
     if found.drives == 2:
         flags.append("two levels: the response is not measured")
     irradiance = found.irradiance * factor

@@ -15,14 +15,16 @@ the room changes by colours the dimmest."""
 SURE = 20.0
 """Readings are compared whose brightest channel is so many of its standard errors, so that noise turns a colour by 3° at most."""
 TURNED_DEGREES, TIMES = 10.0, 5.0
-"""Angle between colours from which an image is of something else, and how many times those of the others it is: LEDs turn by a degree or
-two as they are dimmed, and halogen lamps by 20°, but all along the way."""
+"""Angle between the colour of an image and that of most from which it is said, and how many times those of the others it is where the image
+is of something else: LEDs turn by a degree or two as they are dimmed, and halogen lamps by 20°, but all along the way."""
 LEAST_OTHERS = 2
 """Drives that must have one colour, for another one to differ from them."""
 
 
-def check_images(names: Sequence[str], drives: Sequence[float], pixels: Sequence[bytes], values: np.ndarray, sigmas: np.ndarray) -> None:
-    """Raise CalibrationError if images of a primary are copies of each other, or one has another colour than all others.
+def check_images(names: Sequence[str], drives: Sequence[float], pixels: Sequence[bytes], values: np.ndarray,
+                 sigmas: np.ndarray) -> str | None:
+    """Return what there is to say where the colour of a primary changes with its level, or None.
+    Raises CalibrationError if images are copies of each other, or one has another colour than all others.
 
     Args:
         names: of the images.
@@ -40,15 +42,18 @@ def check_images(names: Sequence[str], drives: Sequence[float], pixels: Sequence
             raise CalibrationError(f"{names[other]} and {names[index]} are the same image, at the levels {drives[other]:.3g} and "
                                    f"{drives[index]:.3g}, and noise is never the same twice: one is a copy of the other")
     colours = values[bright] / np.linalg.norm(values[bright], axis=1, keepdims=True)
-    if len({drives[index] for index in places}) <= LEAST_OTHERS:
-        return
+    if not places:
+        return None
     middle = np.median(colours, axis=0)
     turned = np.degrees(np.arccos(np.clip(colours @ middle / np.linalg.norm(middle), -1, 1)))
     odd = int(turned.argmax())
-    if turned[odd] > max(TURNED_DEGREES, TIMES * np.delete(turned, odd).max()):
+    if turned[odd] < TURNED_DEGREES:
+        return None
+    if len({drives[index] for index in places}) > LEAST_OTHERS and turned[odd] > TIMES * np.delete(turned, odd).max():
         index = places[odd]
         raise CalibrationError(f"{names[index]}, at the level {drives[index]:.3g}, has another colour than at all other levels, by "
                                f"{turned[odd]:.0f} degrees: check that the table names the right images")
+    return f"its colour changes with the level, by {turned[odd]:.0f} degrees"
 
 
 def other_encoding(radiance: np.ndarray, ambient: np.ndarray | float, saturated: np.ndarray | None, direction: np.ndarray, view: BallView,

@@ -27,7 +27,7 @@ def swept(colours, light):
 
 def test_a_copy_of_an_image_is_refused():
     names, drives, pixels, values, sigmas = swept([RED] * 4, DRIVES)
-    check_images(names, drives, pixels, values, sigmas)
+    assert check_images(names, drives, pixels, values, sigmas) is None
     pixels[0], values[0] = pixels[1], values[1]
     with pytest.raises(CalibrationError, match=r"0.png and 1.png are the same image, at the levels 1 and 0.75"):
         check_images(names, drives, pixels, values, sigmas)
@@ -51,8 +51,9 @@ def test_an_image_of_another_primary_is_refused(place):
 
 def test_lamps_that_redden_as_they_are_dimmed_are_not_refused():
     colours = [(1.0, 0.8 * warm, 0.6 * warm**2) for warm in (1.0, 0.85, 0.65, 0.4)]
-    check_images(*swept(colours, DRIVES))
-    check_images(*swept([RED, GREEN], DRIVES[:2]))  # which of two is wrong cannot be told
+    assert check_images(*swept(colours, DRIVES)) == "its colour changes with the level, by 18 degrees"
+    said = check_images(*swept([RED, GREEN], DRIVES[:2]))  # which of two is wrong cannot be told
+    assert said is not None and "its colour changes with the level" in said
 
 
 @pytest.mark.parametrize(("gamma", "named"), [(1.0, False), (1 / 2.2, True)])
