@@ -29,9 +29,8 @@ def contradiction(found: Bundle, names: Sequence[str], views: Sequence[str]) -> 
     """Return how devices contradict each other, and what does, or None. `names`: of the devices. `views`: names of the views."""
     if not found.excess > CONTRADICTED:
         return None
-    own = " and ".join(f"{device.rms_px:.2g}" for device in found.alone)
-    said = (f"{', '.join(names[:-1])} and {names[-1]} contradict each other: alone they fit the boards to {own} px, together to "
-            f"{found.rms_px():.2g} px")
+    own = _listed([f"{device.rms_px:.2g}" for device in found.alone])
+    said = f"{_listed(names)} contradict each other: alone they fit the boards to {own} px, together to {found.rms_px():.2g} px"
     if found.excess > MISREAD:
         for device in range(1, len(names)):
             reading = _other_reading(found, device, names[device], names[0])
@@ -41,6 +40,10 @@ def contradiction(found: Bundle, names: Sequence[str], views: Sequence[str]) -> 
     which = f"; without {', '.join(odd)} they do not" if odd else ""
     return (f"{said}{which}: check that nothing moved or was refocused between the views, that the images of a view are of one moment, and "
             "that the board is flat")
+
+
+def _listed(words: Sequence[str]) -> str:
+    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _odd_views(found: Bundle) -> list[int]:
@@ -57,6 +60,8 @@ def _odd_views(found: Bundle) -> list[int]:
         return []
     odd = views[:int((far[:most] / np.maximum(far[1:most + 1], 1e-300)).argmax()) + 1]  # up to the largest step
     rest = [own._replace(boards={view: pose for view, pose in own.boards.items() if view not in odd}) for own in found.alone]
+    if any(len(rest[0].boards.keys() & own.boards.keys()) < LEAST_VIEWS for own in rest):
+        return []
     agreed = adjust([sight for sight in found.sights if sight.view not in odd], rest).excess < AGREED
     return sorted(odd) if agreed else []
 

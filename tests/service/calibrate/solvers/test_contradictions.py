@@ -40,6 +40,19 @@ def test_a_camera_that_moved_half_way_is_named_with_its_views():
 
 
 @pytest.mark.long
+def test_a_third_camera_that_few_views_show_is_named_too():
+    """Without the views in which it stood elsewhere it would share one view with the first camera, so that no views are named."""
+    random = np.random.default_rng(9)
+    frames = [frame._replace(corners=(*frame.corners, frame.corners[1] + random.normal(0, 0.1, (54, 2)) + (3.0 if number < 2 else 0.0)
+                                      if number < 3 else "hidden")) for number, frame in enumerate(tilted(8, 0.4, 0))]
+    _, others = stereo.calibrate(frames, [*CAMERAS, ("third", SIZES[1])], BOARD, SQUARE)
+    for other in others:
+        said = str(other.certainty.contradiction)
+        assert said.startswith("the camera, right and third contradict each other: alone they fit the boards to 0.14, 0.13 and 0.1")
+        assert "without" not in said
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("shift", [1.0, 2.0])
 def test_errors_of_a_camera_that_moved_are_as_large_as_is_said(shift):
     """Sixteen calibrations, of which each has one error for all depths: their mean square has a spread of a third."""
