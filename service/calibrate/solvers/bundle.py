@@ -135,8 +135,8 @@ class Bundle(NamedTuple):
             raise CalibrationError(f"the poses of the board do not determine {name}: {known}: {TILT}" if contradiction is None or open_alone
                                    else f"{contradiction} ({known})")
         image, lost = self._image_points(device, float(np.median(corners[:, 2])))
-        variances = np.minimum(self._depth_variances(image, device, covariance), 1)
-        depth = float(np.sqrt((variances.sum() + lost) / (len(image) + lost))) if len(image) + lost else at_boards
+        variances = np.minimum(self._depth_variances(image, device, covariance), 1) if len(image) else np.zeros(0)
+        depth = float(np.sqrt((variances.sum() + lost) / max(len(image) + lost, 1)))
         first, other = (sigma[:, :2] / focal).max(axis=1)
         return Certainty((float(first), float(other)), (float(sigma[0, 2:4].max()), float(sigma[1, 2:4].max())), max(depth, at_boards),
                          at_boards, _covered(sights, self.alone[0].size), contradiction)
