@@ -28,6 +28,7 @@ from service.calibrate.results import (
     write_lights,
 )
 from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
+from service.calibrate.solvers.lamp_faults import encoding_flag
 from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_point
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
@@ -195,8 +196,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
                                 residual=found.residual)
         flags = ["not Lambertian under this light"] if found.residual > 0.1 else []
         if other is not None:
-            flags = [f"color_space: {declared} is declared, but as {other[0]} the shading of the ball fits to {100 * other[1]:.1f} %, as "
-                     f"declared to {100 * found.residual:.1f} %"]
+            flags = [encoding_flag(declared, *other, found.residual)]
         room = dark_side(patch.radiance, patch.saturated, light, view, found.scale)
         scale = found.scale * (ANALYSER_GAIN if light.polarization != "none" else 1)
         entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels,

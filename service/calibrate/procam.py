@@ -13,7 +13,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
 from service.calibrate.solvers.bundle import Certainty
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
-from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, outliers, projector_corners
+from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, first_alike, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.patterns import decoded_bands, read_codes
@@ -74,6 +74,11 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
     if not views and remarks:
         folder, reason = next(iter(remarks.items()))
         raise CalibrationError(f"{folder}: {reason} (and so with every view)")
+    firsts = first_alike([(view.camera, view.projector) for view in views])
+    for number, first in enumerate(firsts):
+        if first < number:
+            remarks[views[number].name] = f"left out: a copy of {views[first].name}"
+    views = [view for number, view in enumerate(views) if firsts[number] == number]
     found = calibrate(views, request.board, request.square_m, camera_size, size)
     out = outliers(found)
     if request.drop_outliers and out.any():

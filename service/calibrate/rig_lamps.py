@@ -11,6 +11,7 @@ from service.calibrate.balls import ball_entry, balls_of, find_grey_ball, find_m
 from service.calibrate.results import LightCaptures, digits, three_numbers, write_report
 from service.calibrate.solvers.apply import LitFrame
 from service.calibrate.solvers.chart_patches import ChartPatches, find_patches
+from service.calibrate.solvers.lamp_faults import check_images, other_encoding
 from service.calibrate.solvers.lamp_readings import (
     LEAST_DRIVES,
     LambertTemplate,
@@ -23,7 +24,7 @@ from service.calibrate.solvers.lamp_readings import (
     mirror_ball_template,
 )
 from service.errors import RequestError
-from service.light_estimation.ball import Ball, view_ball
+from service.light_estimation.ball import Ball, BallView, view_ball
 from service.reporting.progress import Progress, Timings
 from service.requests.rig import RigCalibrationRequest, RigTarget
 from stage.capture.capture import Capture
@@ -80,6 +81,8 @@ class Target(NamedTuple):
     entry: dict[str, Any]
     """What the report says of it."""
     chart: ChartPatches | None = None
+    grey: BallView | None = None
+    """The view of a grey ball."""
 
 
 def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = None) -> RigCalibration:
@@ -104,13 +107,14 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
     timings.stage("frames", sum(map(len, sweep.shots.values())))
     ambient = _ambient(correction, sweep.dark, target.box)
     found: dict[int, MeasuredPrimary | CalibrationError] = {}
-    misfit: dict[int, float] = {}
+    shading: dict[int, tuple[float, list[str]]] = {}
     patches: dict[int, np.ndarray] = {}
     done = 0
     for column, shots in sweep.shots.items():
         index, primary = rig.emitters[column]
         try:
-            found[column], misfit[column] = _measure(shots, correction, target, ambient, rig.directions[index])
+            found[column], shading[column] = _measure(shots, correction, target, ambient, rig.directions[index],
+                                                      capture.manifest.color_space)
             if target.chart is not None:
                 patches[column] = _read_patches(shots, correction, target.chart, ambient, rig.directions[index], request.card_normal)
         except CalibrationError as error:
@@ -124,7 +128,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
     measured = {column: each for column, each in found.items() if isinstance(each, MeasuredPrimary)}
     factor = _scale(request, measured)
     result = _with_measured(rig, measured, factor, space)
-    entries = [_entry(rig, column, found[column], factor, misfit.get(column, 0.0), sweep.shots[column]) for column in found]
+    entries = [_entry(rig, column, found[column], factor, *shading.get(column, (0.0, [])), sweep.shots[column]) for column in found]
     timings.close()
     flagged = sum(bool(entry["flags"]) for entry in entries)
     report = write_report("rig", request, request.out.parent, {
@@ -214,7 +218,7 @@ def _target(request: RigCalibrationRequest, capture: Capture, sweep: Sweep) -> T
     view = view_ball(ball, camera)
     return Target(view.box, (lambda radiance, saturated, direction: grey_ball_template(radiance, saturated, direction, view)) if grey else
                   (lambda radiance, saturated, direction: mirror_ball_template(radiance, saturated, direction, ball, view)),
-                  {"balls": [ball_entry(ball)]})
+                  {"balls": [ball_entry(ball)]}, grey=view if grey else None)
 
 
 def _ball(request: RigCalibrationRequest, capture: Capture, sweep: Sweep, *, grey: bool) -> Ball:
@@ -239,28 +243,34 @@ def _ambient(correction: Correction, dark: Sequence[Frame], box: tuple[slice, sl
 
 
 def _measure(shots: list[Shot], correction: Correction, target: Target, ambient: np.ndarray | float,
-             direction: np.ndarray) -> tuple[MeasuredPrimary, float]:
-    """Return a primary, and what its brightest image leaves of the model of the target."""
+             direction: np.ndarray, declared: str) -> tuple[MeasuredPrimary, tuple[float, list[str]]]:
+    """Return a primary, and what its brightest image leaves of the model of the target with what its images say that is flagged."""
     if max(shot.drive for shot in shots) < 1:
         raise CalibrationError("the table has no frame of it at level 1, full level")
     shots = sorted(shots, key=lambda shot: -shot.drive)
     template: LambertTemplate | MirrorTemplate | None = None
-    values, sigmas = [], []
+    values, sigmas, pixels, encoding = [], [], [], None
     for shot in shots:
         image: Radiance = correction.apply(shot.frame)
-        radiance = image.pixels[target.box] - ambient
+        seen, radiance = image.pixels[target.box], image.pixels[target.box] - ambient
         saturated = None if image.saturated is None else image.saturated[target.box]
         try:
-            template = template or target.template(radiance, saturated, direction)
+            if template is None:
+                template = target.template(radiance, saturated, direction)
+                encoding = None if target.grey is None else other_encoding(seen, ambient, saturated, direction, target.grey,
+                                                                           exposure=shot.frame.exposure_s or 1.0, declared=declared)
             reading = template.read(radiance, saturated)
         except CalibrationError as error:
             raise CalibrationError(f"{shot.frame.image}: {error}") from error
         values.append(reading.value)
         sigmas.append(reading.sigma)
+        pixels.append(seen.tobytes())
     assert template is not None
+    colour = check_images([shot.frame.image for shot in shots], [shot.drive for shot in shots], pixels, np.array(values), np.array(sigmas))
     found = fit_primary(np.array([shot.drive for shot in shots]), np.array(values), np.array(sigmas))
     # what the target's shading misses is an error of the model, which does not average out
-    return found._replace(sigma=np.hypot(found.sigma, template.misfit * found.irradiance)), template.misfit
+    found = found._replace(sigma=np.hypot(found.sigma, template.misfit * found.irradiance))
+    return found, (template.misfit, [flag for flag in (encoding, colour) if flag])
 
 
 def _read_patches(shots: list[Shot], correction: Correction, chart: ChartPatches, ambient: np.ndarray | float, direction: np.ndarray,
@@ -321,12 +331,12 @@ def _with_measured(rig: Rig, measured: dict[int, MeasuredPrimary], factor: np.nd
 
 
 def _entry(rig: Rig, column: int, found: MeasuredPrimary | CalibrationError, factor: np.ndarray, misfit: float,
-           shots: list[Shot]) -> dict[str, Any]:
+           said: Sequence[str], shots: list[Shot]) -> dict[str, Any]:
     index, primary = rig.emitters[column]
     named = {"light": rig.lights[index].name, "primary": primary.name, "images": [shot.frame.image for shot in shots]}
     if isinstance(found, CalibrationError):
         return {**named, "left": str(found), "flags": ["left as it was"]}
-    flags = [f"the target misses Lambert's law by {misfit:.0%}"] if misfit > GLOSS else []
+    flags = [*said, *([f"the target misses Lambert's law by {misfit:.0%}"] if misfit > GLOSS else [])]
     if found.drives == 2:
         flags.append("two levels: the response is not measured")
     irradiance = found.irradiance * factor

@@ -15,7 +15,8 @@ import numpy as np
 from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
 from service.calibrate.solvers.bundle import Certainty, Sight, adjust, alone
 from service.calibrate.solvers.charuco import charuco_of, find_board
-from service.calibrate.solvers.procam import LEAST_VIEWS, Lens, board_points, lens_of
+from service.calibrate.solvers.contradictions import contradiction
+from service.calibrate.solvers.procam import LEAST_VIEWS, Lens, board_points, first_alike, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
 from stage.capture.camera import OtherCamera
@@ -83,12 +84,13 @@ def calibrate(frames: Sequence[BoardFrame], cameras: Sequence[tuple[str, Resolut
     found = adjust([sight for own in sights for sight in own], devices)
     lenses = [lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True)]
     errors = {(sight.device, sight.view): float(error) for sight, error in zip(found.sights, found.errors_px, strict=True)}
+    said = contradiction(found, [name for name, _ in cameras], [frame.name for frame in frames])
     others = []
     for device, (name, _) in enumerate(cameras[1:], start=1):
         both = [sight.view for sight in sights[device] if sight.view in firsts]
         pairs = [(frames[view].name, errors[0, view], errors[device, view]) for view in both]
         rms = found.rms_px([sight.device in (0, device) and sight.view in both for sight in found.sights])
-        others.append(OtherCalibration(lenses[device], found.pose(device), rms, found.certainty(device, name), pairs))
+        others.append(OtherCalibration(lenses[device], found.pose(device), rms, found.certainty(device, name, said), pairs))
     return lenses[0], others
 
 
@@ -124,17 +126,23 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
         assert frame.stereo is not None  # chosen so
         names = frame.image, *frame.stereo.images
         corners = [_corners(capture, name, request) for name in names]
-        first = next((each for each in corners if not isinstance(each, str)), None)
-        if request.markers is None and first is not None:
-            corners = [each if isinstance(each, str) else alike_order(first, each) for each in corners]
+        shown = next((each for each in corners if not isinstance(each, str)), None)
+        if request.markers is None and shown is not None:
+            corners = [each if isinstance(each, str) else alike_order(shown, each) for each in corners]
         found.append(BoardFrame(frame.image, tuple(corners)))
         timings.advance(len(found))
     timings.stage("fit", 1)
     named = [("the camera", capture.camera.resolution), *((other.name, other.resolution) for other in capture.manifest.other_cameras)]
+    copies = []
+    for number, first in enumerate(first_alike([frame.corners for frame in found])):
+        if first < number and not all(isinstance(corners, str) for corners in found[number].corners):
+            reason = f"left out: a copy of {found[first].name}"
+            copies.append(f"{found[number].name}: {reason}")
+            found[number] = BoardFrame(found[number].name, (reason,) * len(named))
     lens, others = calibrate(found, named, request.board, request.square_m)
     timings.close()
     paths = manifests_to_replace(targets, manifest_paths)
-    return _write(request, targets, paths, lens, others)
+    return _write(request, targets, paths, lens, others, copies)
 
 
 def _check_cameras(target: Capture, capture: Capture) -> None:
@@ -154,7 +162,7 @@ def _corners(capture: Capture, name: str, request: StereoRequest) -> np.ndarray 
 
 
 def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ...], lens: Lens,
-           others: list[OtherCalibration]) -> StereoResult:
+           others: list[OtherCalibration], copies: list[str]) -> StereoResult:
     names = [other.name for other in targets[0].manifest.other_cameras]
     rows: list[tuple[str, ...]] = []
     entries: list[dict[str, Any]] = []
@@ -170,7 +178,7 @@ def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ..
                for target, path in zip(targets, paths, strict=True)]
     summary = ", ".join(f"{name}: {other.rms_px:.3f} px RMS, baseline {_baseline(other):.4f} m, "
                         f"depths known to {100 * other.certainty.depth:.2g} %" for name, other in zip(names, others, strict=True))
-    warnings = [f"{name}: {said}" for name, other in zip(names, others, strict=True) for said in other.certainty.warnings()]
+    warnings = [*copies, *(f"{name}: {said}" for name, other in zip(names, others, strict=True) for said in other.certainty.warnings())]
     return StereoResult(paths, reports[0], rows, summary, warnings)
 
 

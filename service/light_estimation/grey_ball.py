@@ -119,14 +119,17 @@ def dark_side(radiance: np.ndarray, saturated: np.ndarray | None, light: Distant
 
 
 def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, view: BallView, *,
-                    exposure: float, declared: str, residual: float) -> tuple[str, float] | None:
+                    exposure: float, declared: str, residual: float, ambient: np.ndarray | None = None) -> tuple[str, float] | None:
     """Return another encoding under which the shading of the ball is much more Lambertian, or None.
     `radiance`, `saturated`, `light`, `view`: as of fit_brightness. `exposure`: recorded values over radiance. `residual`: of
-    `fit_brightness` as declared. Returns the colour space that declares the encoding, and the residual under it."""
+    `fit_brightness` as declared. `ambient`: what is seen without the light, as `radiance`; None: nothing. Returns the colour space that
+    declares the encoding, and the residual under it."""
     if residual < LEAST_MISFIT:
         return None
-    others = [(space, fit_brightness(values, saturated, light, view).residual)
-              for space, values in other_readings(radiance, exposure, declared)]
+    without = np.zeros_like(radiance) if ambient is None else ambient
+    dark = dict(other_readings(without, exposure, declared))
+    others = [(space, fit_brightness(values - dark[space], saturated, light, view).residual)
+              for space, values in other_readings(radiance, exposure, declared) if space in dark]
     better = [(space, left) for space, left in others if residual >= TIMES * left]
     return min(better, key=lambda one: one[1], default=None)
 

@@ -26,6 +26,8 @@ LENS, POSE = 8, 6
 DOUBTED, REFUSED = 0.01, 0.03
 """Standard deviation of depths, as a part of them, from which a calibration is remarked on, and from which it is none: beyond it another
 focal length far away fits as well, which the covariance does not tell."""
+GRID = 16
+"""Places across and down the image at which the standard deviation of depths is taken; it changes smoothly."""
 MOST_STEPS = 100
 """Evaluations after which a fit ends: where the boards determine the devices a dozen are enough."""
 TILT = "tilt the board by 30° or more, to another side in each view, and bring it nearer and farther"
@@ -54,6 +56,8 @@ class Alone(NamedTuple):
     boards: dict[int, np.ndarray]
     """By the number of each view that the device sees: rotation vector and translation [6] from the board to the device."""
     rms_px: float
+    size: tuple[int, int]
+    """Width and height of its image."""
 
 
 class Certainty(NamedTuple):
@@ -64,28 +68,43 @@ class Certainty(NamedTuple):
     principal_px: tuple[float, float]
     """The standard deviation of each device's principal point, in pixels."""
     depth: float
-    """The standard deviation of depths where the board was, as a part of the depth: root mean square over its corners."""
+    """The standard deviation of depths over the image, as a part of the depth: root mean square over all places that both devices see."""
+    depth_at_boards: float
+    """The same over the corners of the boards."""
+    covered: float
+    """The part of the first device's image in which boards were."""
+    contradiction: str | None = None
+    """What there is to say of devices that contradict each other."""
 
     def facts(self) -> dict[str, Any]:
         """Return the standard deviations as the report has them."""
-        return {"depth": float(f"{self.depth:.3g}"), "focal": [float(f"{part:.3g}") for part in self.focal],
+        return {"depth": float(f"{self.depth:.3g}"), "depth_at_boards": float(f"{self.depth_at_boards:.3g}"),
+                "focal": [float(f"{part:.3g}") for part in self.focal],
                 "principal_px": [float(f"{pixels:.3g}") for pixels in self.principal_px]}
 
     def warnings(self) -> list[str]:
         """Return what there is to say of depths that are not sure."""
-        return [f"depths are known to {100 * self.depth:.2g} % alone: {TILT}"] if self.depth > DOUBTED else []
+        if self.contradiction is not None:
+            return [f"{self.contradiction} (depths are known to {100 * self.depth:.2g} % alone)"]
+        if self.depth_at_boards > DOUBTED:
+            return [f"depths are known to {100 * self.depth_at_boards:.2g} % alone: {TILT}"]
+        return [f"depths are known to {100 * self.depth_at_boards:.2g} % where boards were, in {100 * self.covered:.0f} % of the image, "
+                f"and to {100 * self.depth:.2g} % over all of it: show the board up to the edges too"] if self.depth > DOUBTED else []
 
 
 class Bundle(NamedTuple):
     """Devices and boards that explain all corners best."""
 
     sights: list[Sight]
+    alone: list[Alone]
     lenses: list[Pinhole]
     places: np.ndarray  # [devices, 6] rotation vector and translation from the first device to each, zeros for the first
     boards: dict[int, np.ndarray]
     """By the number of each view: rotation vector and translation [6] from the board to the first device."""
     errors_px: np.ndarray  # [sights] root mean square
     covariance: np.ndarray  # of the parameters of all lenses and then of all places but the first
+    excess: float
+    """What the corners are off because the devices share boards and places, relative to what noise would leave: 1 but for chance."""
 
     def rms_px(self, counted: Sequence[bool] | None = None) -> float:
         """Return the root mean square error of the corners. `counted`: of each sight, whether its corners count; None: all do."""
@@ -96,33 +115,58 @@ class Bundle(NamedTuple):
         """Return where a device stands in the frame of the first one, [4, 4] metres, both with the axes of a manifest's cameras."""
         return camera_from_projector(cv2.Rodrigues(self.places[device, :3])[0], self.places[device, 3:])
 
-    def certainty(self, device: int, name: str) -> Certainty:
-        """Return how sure a device and the first one are. Raises CalibrationError: the poses of the board leave depths open."""
+    def certainty(self, device: int, name: str, contradiction: str | None = None) -> Certainty:
+        """Return how sure a device and the first one are. `contradiction`: what there is to say where they contradict each other.
+        Raises CalibrationError: the poses of the board leave depths open, or the devices contradict each other."""
         own = np.r_[:LENS, LENS * device:LENS * (device + 1), LENS * len(self.lenses) + POSE * (device - 1) + np.arange(POSE)]
         covariance = self.covariance[np.ix_(own, own)]
-        seen = {sight.view for sight in self.sights if sight.device == device}
-        slopes = np.concatenate([self._depth_slopes(sight, device) for sight in self.sights if not sight.device and sight.view in seen])
-        depth = float(np.sqrt(np.einsum("ni,ij,nj->n", slopes, covariance, slopes).mean()))
-        if not depth < REFUSED:  # nor is it when it is no number
-            known = f"depths would be known to {100 * depth:.2g} % alone" if depth < 1 else "depths would be unknown"
-            raise CalibrationError(f"the poses of the board do not determine {name}: {known}: {TILT}")
         sigma = np.sqrt(np.diag(covariance)[:2 * LENS]).reshape(2, LENS)
-        focal = [float((sigma[index, :2] / np.diag(self.lenses[of].matrix)[:2]).max()) for index, of in enumerate((0, device))]
-        return Certainty((focal[0], focal[1]), (float(sigma[0, 2:4].max()), float(sigma[1, 2:4].max())), depth)
+        focal = np.array([np.diag(self.lenses[of].matrix)[:2] for of in (0, device)])
+        if focal.min() <= 0:
+            raise CalibrationError(contradiction or f"the poses of the board do not determine {name}: a focal length comes out as "
+                                   f"{focal.min():.3g} px: {TILT}")
+        seen = {sight.view for sight in self.sights if sight.device == device}
+        sights = [sight for sight in self.sights if not sight.device and sight.view in seen]
+        corners = np.concatenate([_moved(sight.board, self.boards[sight.view]) for sight in sights])
+        at_boards = float(np.sqrt(self._depth_variances(corners, device, covariance).mean()))
+        if not at_boards < REFUSED:  # nor is it when it is no number
+            known = f"depths would be known to {100 * at_boards:.2g} % alone" if at_boards < 1 else "depths would be unknown"
+            open_alone = not at_boards < REFUSED * max(self.excess, 1.0)**0.5  # were there no contradiction
+            raise CalibrationError(f"the poses of the board do not determine {name}: {known}: {TILT}" if contradiction is None or open_alone
+                                   else f"{contradiction} ({known})")
+        image, lost = self._image_points(device, float(np.median(corners[:, 2])))
+        variances = np.minimum(self._depth_variances(image, device, covariance), 1) if len(image) else np.zeros(0)
+        depth = float(np.sqrt((variances.sum() + lost) / max(len(image) + lost, 1)))
+        first, other = (sigma[:, :2] / focal).max(axis=1)
+        return Certainty((float(first), float(other)), (float(sigma[0, 2:4].max()), float(sigma[1, 2:4].max())), max(depth, at_boards),
+                         at_boards, _covered(sights, self.alone[0].size), contradiction)
 
-    def _depth_slopes(self, sight: Sight, device: int) -> np.ndarray:
-        """Return by which part the depth of each corner changes with lens, other lens and place, [corners, 22], what is seen being held."""
-        count = len(sight.board)
-        turn, shift = self.boards[sight.view][:3], self.boards[sight.view][3:]
-        points = sight.board @ cv2.Rodrigues(turn)[0].T + shift
+    def _image_points(self, device: int, depth: float) -> tuple[np.ndarray, int]:
+        """Return points at a depth that are spread over the image of the first device and that the other one sees, [points, 3], and the
+        count of places in that image which its lens, as it is found, cannot have."""
+        size, (matrix, distortion) = self.alone[0].size, self.lenses[0]
+        pixels = np.stack(np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in size)), axis=-1).reshape(-1, 1, 2)
+        rays = cv2.undistortPoints(pixels, matrix, distortion, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9))
+        points = np.nan_to_num(cv2.convertPointsToHomogeneous(rays).reshape(-1, 3) * depth, posinf=0.0, neginf=0.0)
+        again, there = (cv2.projectPoints(points, pose[:3], pose[3:], *lens)[0].reshape(-1, 2) for pose, lens in (
+            (np.zeros(POSE), self.lenses[0]), (self.places[device], self.lenses[device])))
+        known = np.linalg.norm(again - pixels[:, 0], axis=1) < 1
+        seen = ((there >= 0) & (there <= self.alone[device].size)).all(axis=1)
+        return points[known & seen], int((~known).sum())
+
+    def _depth_variances(self, points: np.ndarray, device: int, covariance: np.ndarray) -> np.ndarray:
+        """Return the variance of the depth of each point [points, 3], relative to it, what is seen being held.
+        `covariance`: of lens, other lens and place, [22, 22]."""
+        count = len(points)
         place = self.places[device]
         by_first, by_second = (cv2.projectPoints(points, pose[:3], pose[3:], *lens)[1].reshape(count, 2, -1) for pose, lens in (
             (np.zeros(POSE), self.lenses[0]), (place, self.lenses[device])))
-        here, there = by_first[..., 3:POSE], by_second[..., 3:POSE] @ cv2.Rodrigues(place[:3])[0]  # by the place of the corner
+        here, there = by_first[..., 3:POSE], by_second[..., 3:POSE] @ cv2.Rodrigues(place[:3])[0]  # by the place of the point
         way = np.einsum("nij,nj->ni", there, points)  # by the part of its depth, along the line of sight
-        aside = -np.linalg.solve(here[..., :2], by_first[..., POSE:POSE + LENS])  # of the corner at its depth
+        aside = -np.linalg.solve(here[..., :2], by_first[..., POSE:POSE + LENS])  # of the point at its depth
         off = np.concatenate([there[..., :2] @ aside, by_second[..., POSE:POSE + LENS], by_second[..., :POSE]], axis=-1)
-        return np.asarray(-np.einsum("ni,nij->nj", way, off) / np.maximum((way**2).sum(axis=1), 1e-300)[:, None])
+        slopes = -np.einsum("ni,nij->nj", way, off) / np.maximum((way**2).sum(axis=1), 1e-300)[:, None]
+        return np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
 
 
 def alone(sights: Sequence[Sight], size: tuple[int, int], name: str) -> Alone:
@@ -133,11 +177,12 @@ def alone(sights: Sequence[Sight], size: tuple[int, int], name: str) -> Alone:
             flags=cv2.CALIB_FIX_K3)  # without corners at the border of the image k3 would fit noise
     except cv2.error as error:
         raise CalibrationError(f"the poses of the board do not determine {name} ({str(error.err).strip().lower()}): {TILT}") from error
-    focal = matrix[0, 0]
-    if not (np.isfinite(matrix).all() and 0.1 < max(focal, matrix[1, 1]) / max(size) < 100):
-        raise CalibrationError(f"the focal length of {name} comes out as {focal:.3g} px: the poses do not determine it: {TILT}")
+    focal = np.diag(matrix)[:2]
+    if not (np.isfinite(matrix).all() and focal.min() > 0.1 * max(size) and focal.max() < 100 * max(size)):
+        wrong = focal.max() if focal.min() > 0.1 * max(size) else focal.min()
+        raise CalibrationError(f"the focal length of {name} comes out as {wrong:.3g} px: the poses do not determine it: {TILT}")
     boards = {sight.view: np.concatenate([turn.ravel(), shift.ravel()]) for sight, turn, shift in zip(sights, turns, shifts, strict=True)}
-    return Alone(Pinhole(matrix, distortion.ravel()[:4]), boards, float(rms))
+    return Alone(Pinhole(matrix, distortion.ravel()[:4]), boards, float(rms), size)
 
 
 def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
@@ -147,8 +192,8 @@ def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     boards = []
     for view in views:
         number, pose = next((number, device.boards[view]) for number, device in enumerate(devices) if view in device.boards)
-        back = _inverse(places[number])
-        boards.append(_after(pose, back))
+        back = inverse(places[number])
+        boards.append(after(pose, back))
     start = np.concatenate([*(_values(device.lens) for device in devices), *places[1:], *boards])
     shared = len(start) - POSE * len(views)
 
@@ -182,36 +227,62 @@ def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     off, slopes = shown(found)
     of_device = np.concatenate([np.full(2 * len(sight.board), sight.device) for sight in sights])
     errors = np.split(off, np.cumsum([2 * len(sight.board) for sight in sights])[:-1])
-    return Bundle(list(sights), *parts(found), np.array([np.sqrt(2 * np.mean(error**2)) for error in errors]),
-                  _covariance(slopes, off, of_device)[:shared, :shared])
+    covariance, excess = _covariance(slopes, off, of_device, devices)
+    return Bundle(list(sights), list(devices), *parts(found), np.array([np.sqrt(2 * np.mean(error**2)) for error in errors]),
+                  covariance[:shared, :shared], excess)
 
 
-def _covariance(slopes: np.ndarray, off: np.ndarray, of_device: np.ndarray) -> np.ndarray:
-    """Return the covariance of a fit by least squares, whose residuals differ from device to device; infinite where something is open."""
+def _covariance(slopes: np.ndarray, off: np.ndarray, of_device: np.ndarray, devices: Sequence[Alone]) -> tuple[np.ndarray, float]:
+    """Return the covariance of a fit by least squares, infinite where something is open, and `Bundle.excess`.
+
+    The noise of each device is what it leaves alone. What the devices leave together beyond that is spent on the parameters that they
+    share, so that the covariance grows with it as with noise."""
     unit = 1 / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
     scaled = slopes * unit
     try:
         inverse = np.linalg.inv(scaled.T @ scaled)
     except np.linalg.LinAlgError:
-        return np.full((len(unit), len(unit)), np.inf)
-    free = max(1 - len(unit) / len(off), 1 / len(off))
-    owns = [of_device == device for device in np.unique(of_device)]
-    spread = sum(scaled[own].T @ scaled[own] * np.mean(off[own]**2) / free for own in owns)
-    return np.asarray(inverse @ spread @ inverse * unit * unit[:, None])
+        return np.full((len(unit), len(unit)), np.inf), 1.0
+    spread, left, expected = np.zeros_like(inverse), 0.0, 0.0
+    for device, alone in enumerate(devices):
+        own = scaled[of_device == device]
+        normal = own.T @ own
+        parameters = LENS + POSE * len(alone.boards)
+        squares = alone.rms_px**2 * len(own) / 2
+        noise = squares / max(len(own) - parameters, 1)
+        spread += normal * noise
+        left += float((off[of_device == device]**2).sum()) - squares
+        expected += noise * (parameters - float((inverse * normal).sum()))
+    excess = left / max(expected, 1e-300)
+    return np.asarray(inverse @ spread @ inverse * unit * unit[:, None]) * max(excess, 1.0), excess
 
 
 def _place(first: Alone, other: Alone) -> np.ndarray:
     """Return a pose from the first device to another one, from the boards that both see."""
-    poses = np.array([_after(_inverse(first.boards[view]), other.boards[view]) for view in first.boards.keys() & other.boards.keys()])
+    poses = np.array([after(inverse(first.boards[view]), other.boards[view]) for view in first.boards.keys() & other.boards.keys()])
     return np.concatenate([Rotation.from_rotvec(poses[:, :3]).mean().as_rotvec(), np.median(poses[:, 3:], axis=0)])
 
 
-def _after(pose: np.ndarray, then: np.ndarray) -> np.ndarray:
+def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return points [points, 3] moved by a pose [6]."""
+    return np.asarray(points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])
+
+
+def _covered(sights: Sequence[Sight], size: tuple[int, int]) -> float:
+    """Return the part of an image that lies in the outline of the corners of any of the sights."""
+    inside = np.zeros(size[::-1], np.uint8)
+    for sight in sights:
+        cv2.fillConvexPoly(inside, cv2.convexHull(sight.corners.astype(np.float32)).astype(np.int32), 1)
+    return float(inside.mean())
+
+
+def after(pose: np.ndarray, then: np.ndarray) -> np.ndarray:
     """Return a pose and then another one, each [6]."""
     return np.concatenate([part.ravel() for part in cv2.composeRT(pose[:3], pose[3:], then[:3], then[3:])[:2]])
 
 
-def _inverse(pose: np.ndarray) -> np.ndarray:
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """Return the way back of a pose [6]."""
     back = -pose[:3]
     return np.concatenate([back, -Rotation.from_rotvec(back).apply(pose[3:])])
 

@@ -156,10 +156,10 @@ def _lambert(radiance: np.ndarray, saturated: np.ndarray | None, usable: np.ndar
         floor = 1e-12 * np.abs(readings).max() + 1e-300  # exact readings have no scatter
         weight = 1 / (1 + (left / (WEIGHT_SCALE * spread + floor)) ** 2)
         value = (weight * readings * model).sum(axis=0) / (weight * model**2).sum(axis=0)
-    left = (readings - model * value) / max(float(value.max()), 1e-300)
-    misfit = float(np.sqrt((weight * left**2).sum() / (weight * model**2).mean(axis=1).sum()))
     if not value.max() > 0:
         raise CalibrationError("the target is dark in the brightest image of the lamp")
+    left = (readings - model * value) / float(value.max())
+    misfit = float(np.sqrt((weight * left**2).sum() / (weight * model**2).mean(axis=1).sum()))
     if misfit > MOST_MISFIT:
         raise CalibrationError(f"the shading of the target misses Lambert's law under this lamp by {misfit:.0%}: check that the table "
                                "names the right lamp, that it alone is lit, and the place of the target")

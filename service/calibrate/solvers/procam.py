@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from service.calibrate.solvers.bundle import Certainty, Pinhole, Sight, adjust, alone
+from service.calibrate.solvers.contradictions import contradiction
 from stage.capture.camera import Distortion
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import distortion_of
@@ -145,7 +146,15 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     found = adjust([*sights[0], *sights[1]], devices)
     camera, projector = (lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True))
     errors, lit = found.errors_px.reshape(2, len(views))
-    return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector"))
+    said = contradiction(found, ("the camera", "the projector"), [view.name for view in views])
+    return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector", said))
+
+
+def first_alike(views: Sequence[Sequence[np.ndarray | str]]) -> list[int]:
+    """Return of each view the first view with exactly the same corners, which is itself but for copies: noise is never the same twice.
+    `views`: corners [corners, 2] as each device sees them, or why it sees none."""
+    keys = [tuple(corners if isinstance(corners, str) else corners.tobytes() for corners in view) for view in views]
+    return [keys.index(key) for key in keys]
 
 
 def outliers(found: ProCam) -> np.ndarray:

@@ -60,7 +60,7 @@ class Contradiction(NamedTuple):
     declared: Projector
     """The view as it was given."""
     projector: Projector
-    """The view that explains the places best."""
+    """The view that explains the places best, of those that may be what was calibrated."""
     part: np.ndarray  # [8] changes of the parameters from the declared view to the one that was found, in units of PRIOR
     covariance: np.ndarray  # [8, 8] of these changes
     whole: np.ndarray  # [8] changes from the view as it was given
@@ -194,8 +194,8 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
         sure = float(part[:free] @ np.linalg.solve(covariance[:free, :free], part[:free])) > LEAST_SQUARE
     if before is None and (size < least_px or gain < LEAST_GAIN or not sure):
         return None
-    return Contradiction(size, float(np.median(np.abs(left))), projector, _turned(projector, part * PRIOR), part, covariance,
-                         so_far + part)
+    found = _turned(projector, np.clip(part, -LARGEST, LARGEST) * PRIOR)
+    return Contradiction(size, float(np.median(np.abs(left))), projector, found, part, covariance, so_far + part)
 
 
 def settled(view: Projector, measure: Callable[[Projector, Contradiction | None], tuple[Found, Contradiction | None]], *,

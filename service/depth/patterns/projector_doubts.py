@@ -42,6 +42,11 @@ def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, fou
             f"projector: columns and rows contradict its calibration, {difference(declared, found.declared)}: depths are those of a "
             f"projector that is ({found.noise_px:.2g} px are left), which found.refined_projector in report.json holds, and the standard "
             "deviations hold what this leaves open")
+    elif not found.plausible:
+        solution.warnings.append(
+            f"projector: columns and rows contradict its calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "
+            "noise), which no small turn of it and no other focal length explain: its lens, or that of the camera, is not known all over "
+            "the image, or something moved while it was calibrated: calibrate again (relit calibrate procam), with boards up to the edges")
     else:
         solution.warnings.append(
             f"projector: columns and rows contradict its calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "

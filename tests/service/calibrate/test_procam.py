@@ -88,6 +88,18 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     assert np.median(off) < 0.01  # of 0.9 m: five views of corners that are good to 0.1 px
 
 
+def test_copies_of_a_pose_count_once(relit, rig, tmp_path):
+    """Noise that is counted again and again is not averaged: σ was 1.8 times too small with four copies of each pose."""
+    folders = [shutil.copytree(folder, tmp_path / folder.name) for folder in rig[0]]
+    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192"
+    reports = []
+    for more in ([], [shutil.copytree(folder, tmp_path / f"again {folder.name}") for folder in folders[:3]]):
+        relit.done("calibrate", "procam", *folders, *more, *words)
+        reports.append(json.loads((folders[0] / "calibration.json").read_text())["procam"])
+    assert reports[0]["sigma"] == reports[1]["sigma"]
+    assert [left["remark"] for left in reports[1]["left_out"]] == [f"left out: a copy of {folder}" for folder in folders[:3]]
+
+
 def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
     """Each pose has another strip of the board cut off by the image or hidden."""
     sheet = charuco.print_of("aruco4", boards.BOARD, side=0.75)
@@ -284,6 +296,18 @@ def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
         assert np.abs(rows[0] - rows[1]).max() < 0.5 and np.median(np.abs(rows[0] - rows[1])) < 0.12  # corners are good to 0.1 px
     report = json.loads((board / "calibration.json").read_text())["stereo"]
     assert len(report["other_cameras"][0]["views"]) == 7 and report["other_cameras"][0]["rms_px"] < 0.4
+
+
+def test_copies_of_a_frame_count_once(relit, board, tmp_path):
+    folder = shutil.copytree(board, tmp_path / "board")
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    for side in ("left", "right"):
+        shutil.copy(folder / f"{side}_2.png", folder / f"{side}_9.png")
+    edit_manifest(folder, frames=[*frames, {"image": "left_9.png", "stereo": {"images": ["right_9.png"]}}])
+    outcome = relit.done("calibrate", "stereo", folder, "--board", "9x6", "--square-m", 0.03)
+    assert "left_9.png: left out: a copy of left_2.png" in outcome.out
+    other, = json.loads((folder / "calibration.json").read_text())["stereo"]["other_cameras"]
+    assert len(other["views"]) == len(frames)
 
 
 def test_what_is_wrong_with_several_cameras_is_said(relit, tmp_path):

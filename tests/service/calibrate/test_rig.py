@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stage.formats import exr
 from stage.rig.chart import read_chart
 from stage.rig.patch import light_at_drive
 from stage.rig.rig import read_rig
@@ -237,3 +238,32 @@ def test_doubtful_images_are_refused_by_name(relit, tmp_path):
     refused("darker at the level", [*lines[:2], *(f"{index + 2},L000,red,{level}" for index, level in enumerate((1, 0.7, 0.3)))])
     refused("--albedo: is missing", options=("--ball", CIRCLE, "--out", tmp_path / "measured.json"))
     refused("--target card: give its place", options=("--target", "card", *ask))
+
+
+@pytest.mark.long
+def test_copies_and_encoded_images_are_said(relit, tmp_path):
+    """Images that are gamma-encoded and declared linear gave twice the irradiance, and a copy of a lower level three quarters."""
+    stage = make_stage(1, 8)
+    rig = nominal(tmp_path, stage)
+    cues, table = swept(relit, rig, "--levels", 4)
+    capture = shoot(tmp_path / "capture", stage, grey_ball(stage), cues)
+    ask = ("--ball", CIRCLE, "--albedo", ALBEDO, "--out", tmp_path / "measured.json")
+    command = ("calibrate", "rig", capture, rig, "--table", table, *ask)
+    relit.done(*command)
+    report = json.loads((tmp_path / "calibration.json").read_text())["rig"]
+    assert report["flagged"] == 0
+    (tmp_path / "two.csv").write_text("\n".join(["frame,light,primary,level", "1,L000,red,0", "4,L000,red,0.75",
+                                                    "9,L000,red,1"]))  # frame 9 shows green
+    relit.done("calibrate", "rig", capture, rig, "--table", tmp_path / "two.csv", *ask)
+    report = json.loads((tmp_path / "calibration.json").read_text())["rig"]
+    assert any("its colour changes with the level" in flag for flag in report["primaries"][0]["flags"])
+    full = (capture / "004.exr").read_bytes()
+    (capture / "004.exr").write_bytes((capture / "003.exr").read_bytes())
+    assert "red of L000: 004.exr and 003.exr are the same image, at the levels 1 and 0.75" in relit.refused(*command)
+    (capture / "004.exr").write_bytes(full)
+    for path in capture.glob("*.exr"):
+        channels, _ = exr.read(path)
+        write_exr(path, np.maximum(np.stack([channels[name] for name in "RGB"], axis=-1), 0) ** (1 / 2.2))
+    relit.done(*command)
+    report = json.loads((tmp_path / "calibration.json").read_text())["rig"]
+    assert report["flagged"] == 5 and all("lin_rec709_scene is declared, but as" in each["flags"][0] for each in report["primaries"])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.calibrate import stereo
-from service.calibrate.solvers.procam import BoardView, board_points, calibrate, find_corners, outliers, projector_corners
+from service.calibrate.solvers.procam import BoardView, board_points, calibrate, find_corners, first_alike, outliers, projector_corners
 from service.calibrate.stereo import BoardFrame
 from stage.capture.camera import Camera
 from stage.capture.projector import Projector
@@ -77,6 +77,13 @@ def test_noisy_corners_and_an_outlier_that_is_named():
 def test_views_with_some_corners_only():
     given = [view._replace(camera=view.camera[:40], projector=view.projector[:40], kept=view.kept[:40]) for view in views(6)]
     check(calibrate(given, BOARD, SQUARE, (400, 300), (800, 600)), 1e-3, 1e-3, 0.1)
+
+
+def test_copies_of_views_are_told():
+    given = list(views(3, noise=0.1))
+    seen = [(view.camera, view.projector) for view in given]
+    assert first_alike(seen) == [0, 1, 2] and first_alike([*seen, seen[1], (seen[0][0], seen[1][1])]) == [0, 1, 2, 1, 4]
+    assert first_alike([("hidden", seen[0][1]), (seen[0][0], "hidden"), ("hidden", seen[0][1])]) == [0, 1, 0]
 
 
 def test_too_few_views_are_refused():
@@ -154,21 +161,23 @@ def test_exact_corners_give_both_cameras_back():
     assert other.rms_px < 1e-9 and len(other.views) == 7 and other.certainty.depth < 1e-5
 
 
-def tilted(count, most, seed):
-    """[count] frames of two cameras with noise of a tenth of a pixel, the board tilted by `most` rad at most."""
+def tilted(count, most, seed, aside=0.1):
+    """[count] frames of two cameras with noise of a tenth of a pixel, the board tilted by `most` rad at most, its middle up to `aside`
+    metres beside the axis of the first."""
     rng = np.random.default_rng(seed)
     for number in range(count):
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_euler("yx", rng.uniform(-most, most, 2)).as_matrix()
-        pose[:3, 3] = rng.uniform((-0.1, -0.08, -1.05), (0.1, 0.08, -0.75))
+        pose[:3, 3] = rng.uniform((-aside, -0.8 * aside, -1.05), (aside, 0.8 * aside, -0.75))
         points = corners_of(pose)
         yield BoardFrame(str(number), tuple(seen + rng.normal(0, 0.1, seen.shape) for seen in (
             reference.project(CAMERA, points), reference.seen_by(PROJECTOR, POSE, points))))
 
 
-def depth_error(camera, projector, place):
-    """[points] by which part depths are off that are triangulated with a calibration."""
-    points = np.stack(np.meshgrid(np.linspace(-0.15, 0.15, 5), np.linspace(-0.1, 0.1, 4), [-0.75, -0.9, -1.05]), axis=-1).reshape(-1, 3)
+def depth_error(camera, projector, place, reach=(0.15, 0.1)):
+    """[points] by which part depths are off that are triangulated with a calibration, up to `reach` metres beside the axis."""
+    points = np.stack(np.meshgrid(*(np.linspace(-side, side, count) for side, count in zip(reach, (5, 4), strict=True)),
+                                  [-0.75, -0.9, -1.05]), axis=-1).reshape(-1, 3)
     view = Projector(resolution=(800, 600), focal_px=projector.focal, principal_px=projector.principal, distortion=projector.distortion,
                      camera_from_projector=place.tolist())
     seen, lit = reference.project(CAMERA, points), reference.seen_by(PROJECTOR, POSE, points)
@@ -189,9 +198,30 @@ def test_how_sure_depths_are_is_told():
     for seed in range(40):
         frames = list(tilted(8, 0.4, seed))
         lens, (other,) = stereo.calibrate(frames, CAMERAS, BOARD, SQUARE)
-        ratios.append(np.sqrt(np.mean(depth_error(lens, other.lens, other.camera_from_other)**2)) / other.certainty.depth)
-        assert other.certainty.depth < 0.006 and other.certainty.warnings() == []
+        ratios.append(np.sqrt(np.mean(depth_error(lens, other.lens, other.camera_from_other)**2)) / other.certainty.depth_at_boards)
+        assert other.certainty.depth_at_boards < 0.006 and other.certainty.contradiction is None
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.5 and max(ratios) < 4
+
+
+@pytest.mark.parametrize(("aside", "seeds"), [(0.02, (0,)), pytest.param(0.05, range(12), marks=pytest.mark.long)])
+def test_how_sure_depths_are_is_told_where_no_board_was(aside, seeds):
+    """Boards in the middle alone leave the edges of the image open: by three times and more what is known where the boards were."""
+    whole, middle = [], []
+    for seed in seeds:
+        lens, (other,) = stereo.calibrate(list(tilted(8, 0.4, seed, aside)), CAMERAS, BOARD, SQUARE)
+        off = np.sqrt(np.mean(depth_error(lens, other.lens, other.camera_from_other, reach=(0.3, 0.22))**2))
+        whole.append(off / other.certainty.depth)
+        middle.append(off / other.certainty.depth_at_boards)
+        warned = [said for said in other.certainty.warnings() if f"in {100 * other.certainty.covered:.0f} % of the image" in said]
+        assert other.certainty.covered < 0.3 and len(warned) == (other.certainty.depth > 0.01)
+    # the points reach beyond some corners of the image and not into others, and each case has one error for all depths
+    assert np.sqrt(np.mean(np.square(middle))) > 3 and np.sqrt(np.mean(np.square(whole))) < 2
+
+
+def test_boards_all_over_the_image_are_not_remarked_on():
+    _, (other,) = stereo.calibrate(list(tilted(8, 0.4, 3, aside=0.2)), CAMERAS, BOARD, SQUARE)
+    assert other.certainty.warnings() == [] and other.certainty.covered > 0.35
+    assert other.certainty.depth < 1.5 * other.certainty.depth_at_boards
 
 
 @pytest.mark.parametrize(("count", "most"), [

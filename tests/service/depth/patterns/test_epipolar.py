@@ -174,3 +174,16 @@ def test_what_cannot_be_refined_is_refused(relit, tmp_path):
     manifest["frames"] = [frame for frame in manifest["frames"] if frame["pattern"]["axis"] == "column"]
     (tmp_path / "capture.json").write_text(json.dumps(manifest))
     relit("depth", tmp_path, "--out", tmp_path / "out", "--refine-projector").refused("one axis alone")
+
+
+@pytest.mark.parametrize("k", [(1.5, 0.0), (-1.0, 3.0)])
+def test_a_lens_that_no_turn_explains_is_not_taken_for_one(relit, tmp_path, k):
+    """As where boards were in the middle of the image alone: a projector turned by 30°, or of a negative focal length, was named."""
+    written(tmp_path, None)
+    manifest = json.loads((tmp_path / "capture.json").read_text())
+    manifest["projector"]["distortion"] = {"model": "brown_conrady", "k": [*k, 0.0]}
+    (tmp_path / "capture.json").write_text(json.dumps(manifest))
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out", "--device", "cpu", "--read-noise", "0.003", "--least-confidence", "0")
+    assert outcome.code in (0, 1), outcome.err
+    said = " ".join(json.loads((tmp_path / "out" / "report.json").read_text())["warnings"])
+    assert "no small turn of it and no other focal length explain" in said and "as if it were turned" not in said
