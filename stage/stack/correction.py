@@ -128,7 +128,7 @@ class Correction:
             return pixels
         below = np.any(pixels < radiance.noise_floor(pixels) - code, axis=-1)[self.capture.mask()]
         brighter, most = ("dark", BRIGHTER_DARK) if self.ambient is None else ("an `off` frame", BRIGHTER_OFF)
-        if below.mean() > most:
+        if below.sum() > most * below.size:
             raise ImageError(f"{self.capture.file(frame.image)}: {brighter} is brighter at {int(below.sum())} of {below.size} pixels of "
                              f"the mask, by {-float(pixels.min()):.2g} at most: check its exposure; {radiance.CLIP_NEGATIVE}")
         return pixels
