@@ -14,12 +14,15 @@ from stage.colour.colour import linearise
 from stage.colour.colour_spaces import channels_apart, is_linear
 from stage.errors import ImageError
 from stage.formats import exr, images
+from stage.spread import MAD_TO_SIGMA
 
 FULL_SCALE = 1.0
 """The largest integer as `images.read_pixels` gives it."""
 BRIGHTER_DARK, BRIGHTER_OFF = 0.25, 0.5
 """Parts of the mask from which on a dark image, and `off` frames, are refused that are brighter there than an image: sensors have pixels
 that glow more in one image than in another, and light of a room flickers."""
+LOOKED_AT = 1 << 18
+"""About how many differences of neighbours are looked at in a larger image."""
 
 
 def saturation_limit(manifest: Manifest, path: Path) -> float:
@@ -126,7 +129,9 @@ class Correction:
             if count:
                 self.capture.clipped[frame.image] = max(count, self.capture.clipped.get(frame.image, 0))
             return pixels
-        below = np.any(pixels < radiance.noise_floor(pixels) - code, axis=-1)[self.capture.mask()]
+        change = np.abs(np.diff(pixels[:: max(1, pixels.size // LOOKED_AT)], axis=1))  # small images do not tell their noise around zero
+        rough = radiance.NOISE_SIGMAS * MAD_TO_SIGMA / 2**0.5 * (np.median(change, axis=(0, 1)) if change.size else 0.0)
+        below = np.any(pixels < np.minimum(radiance.noise_floor(pixels), -rough) - code, axis=-1)[self.capture.mask()]
         brighter, most = ("dark", BRIGHTER_DARK) if self.ambient is None else ("an `off` frame", BRIGHTER_OFF)
         if below.sum() > most * below.size:
             raise ImageError(f"{self.capture.file(frame.image)}: {brighter} is brighter at {int(below.sum())} of {below.size} pixels of "
