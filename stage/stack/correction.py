@@ -1,6 +1,7 @@
 """Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, colours, exposure and ambient light."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,12 +132,17 @@ class Correction:
             return pixels
         change = np.abs(np.diff(pixels[:: max(1, pixels.size // LOOKED_AT)], axis=1))  # small images do not tell their noise around zero
         rough = radiance.NOISE_SIGMAS * MAD_TO_SIGMA / 2**0.5 * (np.median(change, axis=(0, 1)) if change.size else 0.0)
-        below = np.any(pixels < np.minimum(radiance.noise_floor(pixels), -rough) - code, axis=-1)[self.capture.mask()]
+        below = np.any(pixels < np.minimum(radiance.noise_floor(pixels), -rough) - code, axis=-1)[self._mask]
         brighter, most = ("dark", BRIGHTER_DARK) if self.ambient is None else ("an `off` frame", BRIGHTER_OFF)
         if below.sum() > most * below.size:
             raise ImageError(f"{self.capture.file(frame.image)}: {brighter} is brighter at {int(below.sum())} of {below.size} pixels of "
                              f"the mask, by {-float(pixels.min()):.2g} at most: check its exposure; {radiance.CLIP_NEGATIVE}")
         return pixels
+
+    @cached_property
+    def _mask(self) -> np.ndarray:
+        """The mask of the object, which all frames share."""
+        return self.capture.mask()
 
     def has_codes(self, frame: Frame) -> bool:
         """Return whether a frame has integers or half values of which each stands for one radiance, as its header tells."""

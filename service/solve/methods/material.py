@@ -275,8 +275,9 @@ class _Walk:
             self._roughness[pixels] = material.roughness
             error = albedo_error(samples, found.normal, material, shape=kind.lobe, shared=MATT[None] if plain else kind.materials)
             own[:, pixels], tilt[:, pixels] = (half(each.T) for each in error)
-            abundance[pixels], pair[pixels] = (0, 0) if plain else found.mixture
-            pair[pixels[found.mixture.abundance > 0]] += np.uint8(first_pair)
+            if not plain:
+                abundance[pixels], pair[pixels] = found.mixture
+                pair[pixels[found.mixture.abundance > 0]] += np.uint8(first_pair)
             sigma[pixels], result.residual[pixels] = found.sigma, found.residual
             if self._seeks_metals:
                 misread[pixels], shown[pixels] = account_light(samples, found.normal, found)

@@ -52,7 +52,7 @@ def test_scans_with_too_little_in_common_tell_nothing():
 
 
 def test_points_as_dense_as_pixels_tell_too():
-    """Of small scans all pixels are compared: here 40 points lie within four pixels of each, and none of them counts."""
+    """The search goes on beyond the nearest points: here 40 lie within four pixels of each point, and none of them counts."""
     samples, readings = planes(np.random.default_rng(2), 6e-4, 1.0)
     found = shared_sigma(samples, readings, [0, 1, 2, 3], 2e-2)
     # of waves of 200 mm and more a quarter of the variance is alike at 80 mm, so that half of the error shows; eight waves vary
