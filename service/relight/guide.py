@@ -250,6 +250,11 @@ class Guide:
         """The model for many frames."""
         return ModelRange(self._model, self._lights)
 
+    @property
+    def places(self) -> np.ndarray:
+        """[n, 3] Places of the surface in the camera frame."""
+        return self._model.places(self._model.pixels)
+
     def add_near(self, frame: np.ndarray, specular: np.ndarray, near: NearLights) -> None:
         """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.
 

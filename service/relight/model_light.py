@@ -21,6 +21,11 @@ NEAR_MARCHES = 48
 ANYWHERE = 1e30
 """Reach beyond every scene: each sample of an area light takes the nearest marched place."""
 
+MOST_SAMPLES = 4096
+"""The most samples of an area light: on a square they are a 64th of its side apart."""
+WORTH_SAYING = 1e-3
+"""The part of the surface from which on it is said that it is nearer to an area light than the light's samples are apart."""
+
 NearLight = PointLight | SphereLight | RectangleLight
 
 
@@ -100,27 +105,53 @@ class NearLights(NamedTuple):
     coarse: Sources
     """Fewer samples, for sums of captured images."""
     marched: np.ndarray  # [rows, 4] places of the rows of visibility
+    doubts: tuple[str, ...]
+    """A sentence for each light that the surface is too close to."""
 
 
-def near_lights(lights: Sequence[NearLight], first_row: int) -> NearLights:
-    """Return near lights of the camera frame as samples, whose rows of visibility begin at `first_row`."""
+def near_lights(lights: Sequence[NearLight], first_row: int, surface: np.ndarray) -> NearLights:
+    """Return near lights of the camera frame as samples, whose rows of visibility begin at `first_row`.
+
+    Args:
+        surface: [n, 3] places that are lit. Samples of an area light are half as far apart as the nearest of them is from it, as far as
+            MOST_SAMPLES allow: their sum is within 2 % of the integral then, under the border of a rectangle; twice as far apart, 8 %.
+    """
     nothing = far(np.zeros((0, 3)), np.zeros((0, 3)))
-    fine, coarse, marched = [nothing], [nothing], [np.zeros((0, 4), np.float32)]
+    fine, coarse, marched, doubts = [nothing], [nothing], [np.zeros((0, 4), np.float32)], []
     for light in lights:
-        all_samples = _near_samples(light)
+        if isinstance(light, PointLight):
+            axis = None if light.axis is None else np.array(light.axis) / np.linalg.norm(light.axis)
+            all_samples = few = sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)
+        else:
+            area, distance = _extent(light, surface)
+            fewest = sources.SPHERE_SAMPLES if isinstance(light, SphereLight) else sources.RECTANGLE_SAMPLES
+            count = int(np.clip(4 * area / max(float(distance.min()), 1e-9) ** 2, fewest, MOST_SAMPLES))
+            all_samples, few = _area_samples(light, count), _area_samples(light, sources.FEW)
+            pitch = np.sqrt(area / all_samples.count)
+            if (close := float((distance < pitch).mean())) > WORTH_SAYING:
+                doubts.append(f"{close:.1%} of the surface is within {pitch:.2g} of an area light at {light.center_m}, nearer than its samples "
+                              "are apart: its light shows them there")
         samples, places = grouped(all_samples, np.ones(all_samples.count, dtype=bool), first_row, most=NEAR_MARCHES, reach=ANYWHERE)
         first_row += len(places)
         fine.append(samples)
-        coarse.append(_near_samples(light, sources.FEW))
+        coarse.append(few)
         marched.append(places)
-    return NearLights(join(fine), join(coarse), np.concatenate(marched))
+    return NearLights(join(fine), join(coarse), np.concatenate(marched), tuple(doubts))
 
 
-def _near_samples(light: NearLight, count: int | None = None) -> Sources:
+def _area_samples(light: SphereLight | RectangleLight, count: int) -> Sources:
     if isinstance(light, SphereLight):
-        return sources.sphere(np.array(light.center_m), light.radius_m, np.array(light.radiance), count or sources.SPHERE_SAMPLES)
-    if isinstance(light, RectangleLight):
-        return sources.rectangle(np.array(light.center_m), np.array(light.edge_u_m), np.array(light.edge_v_m), np.array(light.radiance),
-                                 count or sources.RECTANGLE_SAMPLES)
-    axis = None if light.axis is None else np.array(light.axis) / np.linalg.norm(light.axis)
-    return sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)
+        return sources.sphere(np.array(light.center_m), light.radius_m, np.array(light.radiance), count)
+    return sources.rectangle(np.array(light.center_m), np.array(light.edge_u_m), np.array(light.edge_v_m), np.array(light.radiance), count)
+
+
+def _extent(light: SphereLight | RectangleLight, surface: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the area of a light, and the distances [n] of places [n, 3] from it."""
+    away = surface - np.array(light.center_m)
+    if isinstance(light, SphereLight):
+        return 4 * np.pi * light.radius_m**2, np.abs(np.linalg.norm(away, axis=1) - light.radius_m)
+    edges = np.array([light.edge_u_m, light.edge_v_m])
+    lengths = np.linalg.norm(edges, axis=1)
+    along = away @ (edges / lengths[:, None]).T
+    beyond = along - np.clip(along, -lengths / 2, lengths / 2)
+    return float(lengths.prod()), np.sqrt(np.maximum((away**2).sum(axis=1) - (along**2).sum(axis=1), 0) + (beyond**2).sum(axis=1))

@@ -76,9 +76,8 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     capture = None if request.capture is None else Capture.open(request.capture, request.pixels)
     if capture is None:
         maps = SurfaceMaps.read(path)
-        frame, specular = _shade_maps(maps, path, lighting, environments, near, device, timings)
+        frame, specular, warnings = _shade_maps(maps, path, lighting, environments, near, device, timings)
         matte = None if request.matte is FrameMatte.NONE else hard_matte(maps.mask)
-        warnings: tuple[str, ...] = ()
     else:
         maps = read_maps(path, capture)
         frame, specular, matte, warnings = _shade_capture(capture, request, maps, path, lighting, environments, near, device, timings)
@@ -122,14 +121,14 @@ def check(request: ShadeRequest) -> Path:
 
 
 def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environments: Environments | None, near: tuple[NearLight, ...],
-                device: str, timings: Timings) -> tuple[np.ndarray, np.ndarray]:
-    """Return [3, pixels] float32 radiance of the maps alone, and its specular part."""
+                device: str, timings: Timings) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Return [3, pixels] float32 radiance of the maps alone, its specular part, and warnings."""
     model = SurfaceModel(maps, path, device)
     around = fibonacci_sphere(SHADOW_DIRECTIONS)
     wanted, marched = light_samples(far_samples(far_light(lighting, environments, maps.color_space)), around)
     places = [np.concatenate([around, np.zeros((SHADOW_DIRECTIONS, 1))], axis=1)] if wanted.count else []
     places.append(marched)
-    close = near_lights(near, sum(map(len, places)))
+    close = near_lights(near, sum(map(len, places)), model.places(model.pixels))
     rows, light = np.concatenate([*places, close.marched]), join([wanted, close.fine])
     frame, specular = (np.zeros((3, maps.mask.size), dtype=np.float32) for _ in range(2))
     timings.stage("shade", len(model.pixels))
@@ -139,7 +138,7 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
         frame[:, batch.pixels], specular[:, batch.pixels] = lit[:3] + lit[3:], lit[3:]
         done += len(batch.pixels)
         timings.advance(done)
-    return frame, specular
+    return frame, specular, close.doubts
 
 
 def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, path: Path, lighting: ScheduledFrame,
@@ -167,6 +166,7 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     specular = guide.correct(frames, [light.model], specular=True)
     assert specular is not None
     timings.advance(1)
-    guide.add_near(frames[0], specular[0], near_lights(near, len(lights.direction)))
+    close = near_lights(near, len(lights.direction), guide.places)
+    guide.add_near(frames[0], specular[0], close)
     timings.advance(2)
-    return frames[0], specular[0], matte, findings.sentences
+    return frames[0], specular[0], matte, (*findings.sentences, *close.doubts)

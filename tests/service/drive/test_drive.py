@@ -197,7 +197,10 @@ def test_the_levels_light_the_owl_as_relight_does(relit, drive, tmp_path):
     outcome = relit("rig", "from-capture", owl_capture, "--out", tmp_path / "rig.json")
     assert outcome.code == 0, outcome.err
     write_sky(tmp_path / "sky.exr", "patches", scale=0.1)
+    (tmp_path / "cues").mkdir()
+    (tmp_path / "cues" / "predicted.0002.exr").write_text("of an earlier run")
     (levels,), report = drive("--environment", tmp_path / "sky.exr", "--capture", owl_capture)
+    assert [path.name for path in (tmp_path / "cues").glob("predicted.*")] == ["predicted.0001.exr"]
     assert report["limits"]["frames"] == 0
     outcome = relit("relight", owl_capture, "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f.#.exr", "--matte", "none")
     assert outcome.code == 0, outcome.err

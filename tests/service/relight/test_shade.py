@@ -95,6 +95,35 @@ def test_a_wall_throws_its_shadow(relit, tmp_path):
     np.testing.assert_allclose(row[25:], lit, rtol=3e-3)
 
 
+def polygon_irradiance(places, corners):
+    """Return the irradiance [rows, cols] on planes that face +z under a polygon of radiance 1 (Lambert's formula)."""
+    toward = corners - places[..., None, :]
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    after = np.roll(toward, -1, axis=-2)
+    normal = np.cross(toward, after)
+    angle = np.arctan2(np.linalg.norm(normal, axis=-1), (toward * after).sum(axis=-1))
+    return np.abs((angle * normal[..., 2] / np.linalg.norm(normal, axis=-1)).sum(axis=-1)) / 2
+
+
+@pytest.mark.parametrize("distance, warned", [(8, False), (0.5, False), (0.1, True)])
+def test_a_rectangle_close_to_the_surface(relit, tmp_path, distance, warned):
+    """A rectangle 16 pixels wide above a plane. Tolerance: 2 % of a sum over samples half as far apart as the light is away,
+    and half rounding; a light that is too close for its samples is named, with the part of the plane below it."""
+    size, half = 32, 8 * PIXEL_M
+    maps = write_relief(tmp_path / "maps", np.zeros((size, size), np.float32))
+    rectangle = text([0, 0, distance * PIXEL_M], [2 * half, 0, 0], [0, 2 * half, 0], [1, 1, 1])
+    outcome = relit("shade", maps, "--rectangle", rectangle, "--out", tmp_path / "p.exr")
+    assert outcome.code == 0, outcome.err
+    assert ("25.0% of the surface is within" in outcome.out) == warned == ("warning" in outcome.out)
+    if warned:
+        return
+    across = (np.arange(size) + 0.5 - size / 2) * PIXEL_M
+    places = np.stack([*np.meshgrid(across, -across), np.zeros((size, size))], axis=-1)
+    corners = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]]) + [0, 0, distance * PIXEL_M]
+    wanted = 0.5 / np.pi * polygon_irradiance(places, corners)
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[..., 1], wanted, rtol=0.022, atol=1e-3 * wanted.max())
+
+
 def test_an_even_environment_is_the_albedo(relit, tmp_path):
     """Radiance 1 from everywhere, no gloss: every pixel has its albedo; 0.5 %: 1024 samples, and shadows of 64 directions at the rim."""
     maps = write_maps(tmp_path / "maps", SURFACE, specular=None, roughness=None)
