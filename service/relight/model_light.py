@@ -129,8 +129,8 @@ def near_lights(lights: Sequence[NearLight], first_row: int, surface: np.ndarray
             all_samples, few = _area_samples(light, count), _area_samples(light, sources.FEW)
             pitch = np.sqrt(area / all_samples.count)
             if (close := float((distance < pitch).mean())) > WORTH_SAYING:
-                doubts.append(f"{close:.1%} of the surface is within {pitch:.2g} of an area light at {light.center_m}, nearer than its samples "
-                              "are apart: its light shows them there")
+                doubts.append(f"{close:.1%} of the surface is within {pitch:.2g} of an area light at {light.center_m}, nearer than its "
+                              "samples are apart: its light shows them there")
         samples, places = grouped(all_samples, np.ones(all_samples.count, dtype=bool), first_row, most=NEAR_MARCHES, reach=ANYWHERE)
         first_row += len(places)
         fine.append(samples)

@@ -28,7 +28,7 @@ from service.relight.plan import Plan, PlannedFrame, add_up, in_groups, make_pla
 from service.relight.sheet import contact_sheet, display_frame
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, other_camera, report
+from service.reporting.provenance import metadata, other_manifest, report
 from service.requests.light.picture_options import Layer
 from service.requests.relight import CHUNK_FRAMES, RelightRequest
 from stage.files import write_text
@@ -159,7 +159,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             images = guide.images
             stack = images.stack
         findings.add_doubt(guide.doubt)
-        findings.add_doubt(other_camera(maps.camera, opened.capture, opened.maps))
+        findings.add_doubt(other_manifest(maps, opened.capture, opened.maps))
     images = images or ImagesOnDevice(stack, device)
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))

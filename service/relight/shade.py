@@ -28,7 +28,7 @@ from service.relight.surface_model import SurfaceModel
 from service.relight.time_steps import capture_files
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, other_camera
+from service.reporting.provenance import metadata, other_manifest
 from service.requests.light.picture_options import FrameMatte, Layer
 from service.requests.relight import LightWeights
 from service.requests.shade import ShadeRequest
@@ -160,7 +160,7 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     findings = FrameFindings(guided=True)
     findings.add_beyond([None], [light.share_beyond], captured.beyond_degrees)
     findings.add_doubt(guide.doubt)
-    findings.add_doubt(other_camera(maps.camera, capture, path))
+    findings.add_doubt(other_manifest(maps, capture, path))
     findings.add_clipped([None], light.weights[None], clipping)
     assert light.model is not None
     specular = guide.correct(frames, [light.model], specular=True)

@@ -1,5 +1,6 @@
 """Provenance: the attributes in EXR and USD files that say what a result was made from, and the text of reports."""
 
+import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping
@@ -12,10 +13,10 @@ from typing import Any
 from service import __version__
 from service.requests.base.base import Options, Role
 from service.requests.base.options import role_of
-from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.colour.configuration import current
 from stage.errors import ResultError
+from stage.results.maps import SurfaceMaps
 from stage.stack.ingest import LAYOUT
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencolorio", "opencv-python-headless", "usd-core")
@@ -26,6 +27,8 @@ COLOURS, CACHE_ID = "OpenColorIO configuration", "OpenColorIO cache id"
 cache id that OpenColorIO gives it."""
 HASHING = "relit:hashing"
 """Attribute of maps with the version of the stack cache by which `relit:inputs` was hashed: each version hashes otherwise."""
+LIGHTS = "relit:declared_lights"
+"""Attribute of maps with the content hash of the lights that the manifest declared."""
 
 _names: ContextVar[dict[str, str] | None] = ContextVar("names of places", default=None)
 
@@ -89,11 +92,19 @@ def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str 
             "hashed images otherwise, so that nothing tells whether they are those of the capture: solve it again if in doubt")
 
 
-def other_camera(camera: Camera, capture: Capture, maps: Path) -> str | None:
-    """Return the sentence for maps with another camera than the capture has; None: they have the same."""
-    differs = [name for name, value in camera if value != getattr(capture.camera, name)]
-    return None if not differs else (f"{maps}: was solved with another camera.{', camera.'.join(differs)} than the manifest of the capture "
-                                     "has now: solve it again, or what is placed by the maps stands elsewhere than they say")
+def hash_of_lights(capture: Capture) -> str:
+    """Return the content hash of the lights that a manifest declares, frame by frame."""
+    declared = [None if frame.light is None else frame.light.model_dump(mode="json") for frame in capture.manifest.frames]
+    return hashlib.sha256(json.dumps(declared).encode()).hexdigest()
+
+
+def other_manifest(maps: SurfaceMaps, capture: Capture, path: Path) -> str | None:
+    """Return the sentence for maps, read from a path, of a capture whose manifest had another camera or other lights; None: the same."""
+    differs = [f"another camera.{name}" for name, value in maps.camera if value != getattr(capture.camera, name)]
+    lights = hash_of_lights(capture)
+    differs += ["other lights"] if maps.provenance.get(LIGHTS, lights) != lights else []
+    return None if not differs else (f"{path}: was solved with {', '.join(differs)} than the manifest of the capture has now: solve it "
+                                     "again, or what the maps say does not fit the images")
 
 
 def export_metadata(request: Options, contents: Mapping[str, str]) -> dict[str, str]:

@@ -12,7 +12,7 @@ from kernels.device import to_numpy
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
+from service.reporting.provenance import HASHING, LIGHTS, REPORT_FILE, hash_of_lights, metadata, report
 from service.requests.solve import MAX_SIGMA, Materials, Method, SolveRequest
 from service.sharing.sharing import SharedSolve
 from service.solve.albedo_scale import scale_albedo
@@ -169,7 +169,8 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     outdated = devices.outdated_driver() if request.device is None else None
     solution.warnings += [outdated] if outdated else []
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
-    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents) | {HASHING: str(LAYOUT)}
+    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
+    sources |= {HASHING: str(LAYOUT), LIGHTS: hash_of_lights(capture)}
     sources |= {ALBEDO_SCALE: f"{albedo_scale:g}"} if albedo_scale != 1 else {}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)
     timings.stage("write", 1)
