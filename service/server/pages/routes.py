@@ -205,5 +205,5 @@ async def icon(request: Request) -> Response:
 
 
 def _page(request: Request, template: str, **values: Any) -> Response:
-    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), here=request.url.path, **values)
+    text = templates.get_template(template).render(has_stage=request.app.state.has_stage, here=request.url.path, **values)
     return Response(text, media_type="text/html", headers=HEADERS)
