@@ -5,6 +5,8 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from pydantic import BaseModel
+
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
@@ -20,8 +22,9 @@ from stage.files import resolved, write_text
 
 ANNOTATIONS_FILE = "annotations.json"
 R = TypeVar("R", bound=Options)
-NAMES = ("images", "masks", "dark_images")
-"""Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers."""
+NAMES = ("images", "masks", "dark_images", "reflectances", "table")
+"""Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers, or a JSON
+document."""
 
 
 class StepFiles(NamedTuple):
@@ -45,21 +48,27 @@ class StepFiles(NamedTuple):
         values = {**dict(getattr(job, "options", ())), **given}
         for name in type(job).model_fields:
             if name in model.model_fields and name not in JobRequest.model_fields and name not in values:
-                value = getattr(job, name)
-                values[name] = (tuple(file_within(values["capture"], each, name) for each in value) if name in NAMES
-                                else self._place(value))
+                values[name] = self._place(name, getattr(job, name), values.get("capture"))
         capture = next(iter(getattr(job, "captures", ())), getattr(job, "capture", None))
         ours = {"device": self.device, "cache": None if capture is None else self.cache(capture)}
         return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
 
-    def _place(self, identified: Any) -> Any:
-        if identified is None:
+    def _place(self, field: str, value: Any, capture: Path | None) -> Any:
+        """Return the file or folder that the value of a job's field stands for; a document is written as FIELD.json among the results."""
+        if value is None:
             return None
-        if isinstance(identified, tuple):
-            return tuple(map(self._place, identified))
-        if identified.startswith(ENVIRONMENT):
-            return self.environment_image(identified)
-        return self.intake(identified) if identified.startswith(CAPTURE) else self.maps(identified)
+        if isinstance(value, tuple):
+            return tuple(self._place(field, each, capture) for each in value)
+        if isinstance(value, BaseModel):
+            path = self.out / f"{field}.json"
+            write_text(path, value.model_dump_json(by_alias=True, indent=2, exclude_defaults=True) + "\n")
+            return path
+        if field in NAMES:
+            assert capture is not None, "it is a field of all jobs with such names"
+            return file_within(capture, value, field)
+        if value.startswith(ENVIRONMENT):
+            return self.environment_image(value)
+        return self.intake(value) if value.startswith(CAPTURE) else self.maps(value)
 
     @property
     def out(self) -> Path:

@@ -12,7 +12,7 @@ from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
 from service.server.jobs import importing, scan_sets, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.one_step import ONE_STEP, export, write_keys
+from service.server.jobs.one_step import ONE_STEP, export
 from service.server.jobs.places import StepFiles
 from service.server.storage import layout
 
@@ -98,7 +98,7 @@ def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> No
     from service.requests.relight import RelightRequest
 
     out = files.out
-    wanted = files.request(RelightRequest, request, keys=write_keys(request.keys, files), out=str(out / layout.FRAMES))
+    wanted = files.request(RelightRequest, request, out=str(out / layout.FRAMES))
     for part in _parts(chunk, out) if files.job.is_resumed else [chunk]:
         relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress)
 
