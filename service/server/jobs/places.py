@@ -41,7 +41,7 @@ class StepFiles(NamedTuple):
 
     def cache(self, capture: str) -> Path:
         """Return the folder of the image stack of a capture."""
-        return self.context.cache / capture
+        return self.context.settings.cache / capture
 
     def request(self, model: type[R], job: JobRequest, **given: Any) -> R:
         """Return the request of a product: values `given`, options of a job, and folders and files for its identifiers and names."""
@@ -89,9 +89,9 @@ class StepFiles(NamedTuple):
 
         folder, root = self.intake_place(identifier)
         if root is not None and identifier.startswith(CAPTURE):
-            recheck_capture(folder, max_pixels=self.context.max_pixels, number=number)
+            recheck_capture(folder, max_pixels=self.context.settings.max_pixels, number=number)
         elif root is not None:
-            admit_environment(folder, max_pixels=self.context.max_pixels)
+            admit_environment(folder, max_pixels=self.context.settings.max_pixels)
         return folder
 
     def intake_place(self, identifier: str) -> tuple[Path, Path | None]:
@@ -103,11 +103,11 @@ class StepFiles(NamedTuple):
         if row["folder"] is None:
             return _named(context.storage.local(layout.intake(project, identifier), progress=self.progress), identifier), None
         folder = Path(row["folder"])
-        root = next((root for root in context.roots_of(project) if folder.is_relative_to(root)), None)
+        root = next((root for root in context.settings.roots_of(project) if folder.is_relative_to(root)), None)
         if resolved(folder) != folder or root is None:
             raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
         top = folder if identifier.startswith(CAPTURE) else folder.parent
-        context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
+        context.held.enter_context(inputs.confined(top, root, max_pixels=context.settings.max_pixels))
         return _named(folder, identifier), root
 
     def write_annotations(self, source: str) -> None:
@@ -140,9 +140,9 @@ def file_within(capture: Path, name: str, field: str) -> Path:
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:
     """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know."""
-    names = {f"{context.cache.parent}/": ""}
+    names = {f"{context.settings.data}/": ""}
     for row in intakes.read_by(context.database, job):
-        names |= {f"{root}/": "" for root in context.roots_of(row["project"])}
+        names |= {f"{root}/": "" for root in context.settings.roots_of(row["project"])}
         if row["folder"] is not None:
             names[row["folder"]] = row["id"] if row["kind"] == CAPTURE else Path(row["folder"]).name
     for place in sorted(names, key=len, reverse=True):
