@@ -100,7 +100,8 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 
 @pytest.mark.parametrize(("library", "homes"), [
     ("pxr", ["service.asset.usd"]), ("pygltflib", ["service.asset.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
-    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.twin", "service.acquisition.projector"]),
+    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.twin", "service.acquisition.projector",
+                 "service.acquisition.set_routes"]),
     ("sacn", ["service.play.sacn_output"]),
     ("serial", ["service.acquisition.lights.serial_line"]), ("gphoto2", ["service.acquisition.cameras"]),
     ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +206,14 @@ def lines_of(folder: Path) -> list[dict[str, Any]]:
     """Return the whole lines of the journal of a capture that may be going on; the first is its head."""
     path = folder / JOURNAL_FILE
     return [json.loads(line) for line in _whole(path.read_bytes()).splitlines()] if path.exists() else []
+
+
+def taken_by(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the lines of the pictures that shots have, by the key of the shot."""
+    taken: dict[str, dict[str, Any]] = {}
+    for line in lines:
+        record(taken, line)
+    return taken
 
 
 def record(taken: dict[str, dict[str, Any]], line: dict[str, Any]) -> None:

@@ -86,7 +86,6 @@ class _Taken(NamedTuple):
     shot: Shot
     pixels: np.ndarray  # [rows, cols, 3] float32 recorded, thinned out
     tile: np.ndarray  # [rows, cols] float32 linear
-    exposure_s: float | None
 
 
 def meter(request: AcquireRequest, ask: Ask, progress: Progress | None = None) -> Metered:
@@ -191,7 +190,7 @@ class _Meter:
         row, column = self._place
         step = max(1, int(np.ceil(np.sqrt(picture.pixels[..., 0].size / MOST_PIXELS))))
         tile = linearise(picture.pixels[row:row + TILE_PX, column:column + TILE_PX].astype(np.float32), self._space).mean(axis=2)
-        return _Taken(shot, np.ascontiguousarray(picture.pixels[::step, ::step], dtype=np.float32), tile, exposure)
+        return _Taken(shot, np.ascontiguousarray(picture.pixels[::step, ::step], dtype=np.float32), tile)
 
     def _reading(self, taken: _Taken, seen: np.ndarray, exposure: float | None) -> Reading:
         recorded = taken.pixels.max(axis=2)[seen]

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from service.acquisition.cameras.camera import LIVE
-from service.acquisition.capture_files import JOURNAL_FILE, lines_of, record
+from service.acquisition.capture_files import JOURNAL_FILE, lines_of, taken_by
 from service.acquisition.early_ingest import PREVIEW_FILE
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.live_view import LiveView
@@ -144,7 +144,9 @@ class RemoteControl:
     def confirm(self) -> None:
         """Tell the capture that a person has done what it asked for."""
         with self._lock:
-            self._answer()
+            if self._prompt is not None and self._running():
+                self._prompt = None
+                os.write(self._terminal, b"\n")
 
     def stop(self) -> None:
         """End the capture as Ctrl-C does, with the lamps dark and its pictures kept."""
@@ -178,12 +180,8 @@ class RemoteControl:
 
         `version` is a word that is another one when its pictures are; None where there is no capture with all of them.
         """
-        taken: dict[str, dict[str, Any]] = {}
-        retaken: dict[str, int] = {}
-        for line in lines_of(self._capture):
-            record(taken, line)
-            if line.get("event") == "rejected":
-                retaken[line["shot"]] = retaken.get(line["shot"], 0) + 1
+        lines = lines_of(self._capture)
+        taken, retaken = taken_by(lines), Counter(line["shot"] for line in lines if line.get("event") == "rejected")
         running = self._running()
         faults = {key: [_named(*fault) for fault in line.get("faults", [])] for key, line in taken.items()}
         if not running and taken and (report := self._capture / REPORT_FILE).exists():  # all pictures together have been judged
@@ -191,7 +189,7 @@ class RemoteControl:
             for fault in json.loads(report.read_text())["faults"]:
                 faults.setdefault(fault["shot"], []).append(_named(fault["kind"], fault["sentence"]))
         shots = [{"shot": shot.key, "step": _step_of(shot), "lamp": shot.lamp, "taken": shot.key in taken,
-                  "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
+                  "retaken": retaken[shot.key], "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
         live, version = self._live, self._version()
         chosen = PlanChoices.model_validate(self._chosen, from_attributes=True)  # without what else a request holds
@@ -241,9 +239,7 @@ class RemoteControl:
 
     def _version(self) -> str | None:
         """Return a word that is another one when the capture is; None where not all of its pictures are there, or it is being made."""
-        taken: dict[str, dict[str, Any]] = {}
-        for line in lines_of(self._capture):
-            record(taken, line)
+        taken = taken_by(lines_of(self._capture))
         if self._running() or not self._shots or len(taken) < len(self._shots) or not (self._capture / FILE_NAME).exists():
             return None
         return f"{self._taken_at()}-{(self._capture / FILE_NAME).stat().st_mtime_ns}"
@@ -255,11 +251,6 @@ class RemoteControl:
         """Return the kind of `relit calibrate`, and the capture that it reads, of each step that belongs to the capture that is shown."""
         return {step: (kind, folder) for step, kinds in CALIBRATIONS.items() for name in (self._name, f"{self._name}-{step}")
                 for place, kind in kinds.items() if self._name and ((folder := self._folder / name / place) / FILE_NAME).exists()}
-
-    def _answer(self) -> None:
-        if self._prompt is not None and self._running():
-            self._prompt = None
-            os.write(self._terminal, b"\n")
 
     def _refuse_beside_another(self) -> None:
         if self._running():

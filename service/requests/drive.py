@@ -1,8 +1,8 @@
 """The options of `relit drive`."""
 
-from abc import abstractmethod
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
@@ -53,10 +53,14 @@ class _CheckedDocument(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
+    MODEL: ClassVar[str]
+    """The module:class of the model, which is imported with NumPy, without which requests and the command line start."""
+
     @classmethod
-    @abstractmethod
     def _model(cls) -> type[BaseModel]:
-        """Return the model, imported with NumPy, without which requests and the command line start."""
+        module, _, name = cls.MODEL.partition(":")
+        found: type[BaseModel] = getattr(import_module(module), name)
+        return found
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,12 +83,7 @@ class RigDocument(_CheckedDocument):
 
     schema_: Literal["relit.rig/1"] = Field(alias="schema")
     """The kind and version of the file."""
-
-    @classmethod
-    def _model(cls) -> type[BaseModel]:
-        from stage.rig.rig import Rig
-
-        return Rig
+    MODEL = "stage.rig.rig:Rig"
 
 
 class ChartDocument(_CheckedDocument):
@@ -92,12 +91,7 @@ class ChartDocument(_CheckedDocument):
 
     schema_: Literal["relit.chart/1"] = Field(alias="schema")
     """The kind and version of the file."""
-
-    @classmethod
-    def _model(cls) -> type[BaseModel]:
-        from stage.rig.chart import Chart
-
-        return Chart
+    MODEL = "stage.rig.chart:Chart"
 
 
 class DriveRequest(ReviewOptions, DriveOptions, Request):

@@ -1,7 +1,7 @@
 """The options of `relit shade`."""
 
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -17,11 +17,6 @@ RIGHT_ANGLE = 1e-3
 
 BRIGHTEST = 1e15
 """The largest value of a light: far brighter than half can show, and safe from overflow."""
-
-
-class _Member(NamedTuple):
-    name: str
-    numbers: int
 
 
 def _light(value: Vector) -> Vector:
@@ -83,9 +78,11 @@ class RectangleLight(_NearLight):
         return self
 
 
-def _read(form: str, parts: tuple[_Member, ...], optional: int = 0) -> Any:
-    """Return a validator that reads `a,b,c,…`; lists of JSON become tuples."""
-    whole, least = sum(part.numbers for part in parts), sum(part.numbers for part in parts[: len(parts) - optional])
+def _read(form: str, model: type[_NearLight]) -> Any:
+    """Return a validator that reads `a,b,c,…`, the fields of a light one after another, also without those that have a default; lists of
+    JSON become tuples."""
+    counts = {name: 1 if field.annotation is float else 3 for name, field in model.model_fields.items()}
+    whole, least = sum(counts.values()), sum(count for name, count in counts.items() if model.model_fields[name].is_required())
 
     def read(given: Any) -> Any:
         if isinstance(given, dict):
@@ -99,10 +96,10 @@ def _read(form: str, parts: tuple[_Member, ...], optional: int = 0) -> Any:
         if len(numbers) not in (least, whole):
             raise ValueError(f"{given!r} is not {form}")
         found: dict[str, Any] = {}
-        for part in parts:
-            taken, numbers = numbers[: part.numbers], numbers[part.numbers :]
+        for name, count in counts.items():
+            taken, numbers = numbers[:count], numbers[count:]
             if taken:
-                found[part.name] = taken[0] if part.numbers == 1 else tuple(taken)
+                found[name] = taken[0] if count == 1 else tuple(taken)
         return found
 
     return read
@@ -112,12 +109,9 @@ POINT_FORM = "x,y,z,r,g,b[,ax,ay,az,anisotropy]"
 SPHERE_FORM = "x,y,z,radius,r,g,b"
 RECTANGLE_FORM = "x,y,z,ux,uy,uz,vx,vy,vz,r,g,b"
 
-GivenPoint = Annotated[PointLight, BeforeValidator(_read(POINT_FORM, (
-    _Member("position_m", 3), _Member("intensity", 3), _Member("axis", 3), _Member("anisotropy", 1)), optional=2))]
-GivenSphere = Annotated[SphereLight, BeforeValidator(_read(SPHERE_FORM, (
-    _Member("center_m", 3), _Member("radius_m", 1), _Member("radiance", 3))))]
-GivenRectangle = Annotated[RectangleLight, BeforeValidator(_read(RECTANGLE_FORM, (
-    _Member("center_m", 3), _Member("edge_u_m", 3), _Member("edge_v_m", 3), _Member("radiance", 3))))]
+GivenPoint = Annotated[PointLight, BeforeValidator(_read(POINT_FORM, PointLight))]
+GivenSphere = Annotated[SphereLight, BeforeValidator(_read(SPHERE_FORM, SphereLight))]
+GivenRectangle = Annotated[RectangleLight, BeforeValidator(_read(RECTANGLE_FORM, RectangleLight))]
 
 
 class ShadeOptions(PictureOptions, PixelOptions):

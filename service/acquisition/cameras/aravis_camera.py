@@ -49,9 +49,10 @@ class AravisCamera(Camera):
 
     def __init__(self, detail: str, setup: Setup) -> None:
         self._name, self._setup, self._count = f"--camera aravis{':' * bool(detail)}{detail}", setup, 0
-        library = _library()
-        if library is None:
-            raise RequestError(f"{self._name}: needs the library Aravis, which is not installed: apt install libaravis-0.8-0")
+        try:
+            library = _library()
+        except OSError:
+            raise RequestError(f"{self._name}: needs the library Aravis, which is not installed: apt install libaravis-0.8-0") from None
         if detail.startswith("Fake"):
             library.arv_enable_interface(b"Fake")
         try:
@@ -145,7 +146,6 @@ class AravisCamera(Camera):
 
     def _pixels(self, buffer: int) -> np.ndarray:
         library = _library()
-        assert library is not None
         if library.arv_buffer_get_status(buffer) != 0:
             raise NoPictureError("the picture came incomplete: check the network, its packet size and the cable")
         size = c_size_t()
@@ -169,12 +169,9 @@ class AravisCamera(Camera):
 
 
 @cache
-def _library() -> ctypes.CDLL | None:
-    """Return Aravis with the signatures of functions that take no error; None: it is not installed."""
-    found = find_library(LIBRARY)
-    if found is None:
-        return None
-    library = ctypes.CDLL(found)
+def _library() -> ctypes.CDLL:
+    """Return Aravis with the signatures of functions that take no error. Raises OSError if it is not installed."""
+    library = ctypes.CDLL(find_library(LIBRARY) or LIBRARY)
     for name in ("arv_buffer_get_status", "arv_buffer_get_image_width", "arv_buffer_get_image_height"):
         getattr(library, name).argtypes = [c_void_p]
     library.arv_buffer_get_data.restype, library.arv_buffer_get_data.argtypes = c_void_p, [c_void_p, POINTER(c_size_t)]
@@ -195,9 +192,7 @@ def _call(name: str, result: Any, types: list[Any], *arguments: Any) -> Any:
 
 
 def _unref(thing: int) -> None:
-    library = _library()
-    assert library is not None
-    library.g_object_unref(thing)
+    _library().g_object_unref(thing)
 
 
 def open_camera(detail: str, setup: Setup) -> AravisCamera:

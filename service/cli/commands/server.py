@@ -56,10 +56,11 @@ def serve(
         run(settings)
         return
     from service.acquisition.remote_control import RemoteControl
+    from service.acquisition.set_routes import routes_of
 
     stage = RemoteControl(rig, camera, settings.set_captures, trigger=trigger, projector=projector, projector_port=projector_port)
     try:
-        run(settings, set_stage=stage)
+        run(settings, set_routes=routes_of(stage))
     finally:
         stage.close()
 

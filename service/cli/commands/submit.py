@@ -46,27 +46,24 @@ def register(app: typer.Typer) -> None:
 def _submission(job: type[JobRequest]) -> Callable[..., None]:
     def submit(given: Given[job], server: ServerOption = DEFAULT_SERVER, key: KeyOption = None,  # type: ignore[valid-type]
                wait: WaitOption = False, out: ResultsOption = None, cancel_on_interrupt: CancelOption = False) -> None:
-        _submit(given, server, key, wait, out, cancel_on_interrupt)
+        inputs = {option.name: prefix for option in options_of(job) if (prefix := _prefix(option)) and option.name in given.values}
+        if "frames" in given.values:
+            frame_numbers(given.values["frames"], 1)
+        for option in options_of(job):
+            if is_document(option.kind) and option.name in given.values:
+                given.values[option.name] = read_record(given.values[option.name], option.kind)
+        chosen = {name: _each(given.values[name], partial(_placeholder, prefix)) for name, prefix in inputs.items()}
+        request: JobRequest = given.build(**chosen)
+        with connected(server, key) as client:
+            if out is not None:
+                make_folder(out)  # before hours of waiting
+            sent = {name: _each(given.values[name], partial(_send, client, prefix)) for name, prefix in inputs.items()}
+            submitted = client.jobs.submit(request.model_copy(update=sent))
+            print(f"job         {submitted.id}", flush=True)
+            if wait or out is not None:
+                wait_for(client, submitted.id, out=out, cancel_on_interrupt=cancel_on_interrupt)
 
     return submit
-
-
-def _submit(given: Given[JobRequest], server: str, key: str | None, wait: bool, out: Path | None, cancel_on_interrupt: bool) -> None:
-    inputs = {option.name: prefix for option in options_of(given.model) if (prefix := _prefix(option)) and option.name in given.values}
-    if "frames" in given.values:
-        frame_numbers(given.values["frames"], 1)
-    for option in options_of(given.model):
-        if is_document(option.kind) and option.name in given.values:
-            given.values[option.name] = read_record(given.values[option.name], option.kind)
-    request = given.build(**{name: _each(given.values[name], partial(_placeholder, prefix)) for name, prefix in inputs.items()})
-    with connected(server, key) as client:
-        if out is not None:
-            make_folder(out)  # before hours of waiting
-        sent = {name: _each(given.values[name], partial(_send, client, prefix)) for name, prefix in inputs.items()}
-        job = client.jobs.submit(request.model_copy(update=sent))
-        print(f"job         {job.id}", flush=True)
-        if wait or out is not None:
-            wait_for(client, job.id, out=out, cancel_on_interrupt=cancel_on_interrupt)
 
 
 def _each(given: str | list[str], identify: Callable[[str], str]) -> str | tuple[str, ...]:

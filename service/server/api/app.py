@@ -2,7 +2,7 @@
 
 import threading
 
-from fastapi import FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.telemetry import TelemetryConfig
 from opentelemetry.trace import TracerProvider
 
@@ -18,11 +18,10 @@ from service.server.api import (
     operations,
     problems,
     results,
-    stage,
     tus,
     uploads,
 )
-from service.server.api.context import Service
+from service.server.api.context import Service, require_admin
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
 from service.server.api.tokens import TokenReader
@@ -34,13 +33,15 @@ from service.server.pages import routes as pages
 from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts
 
+Routes = APIRouter
+"""Routes that another part of the program adds to those of the service."""
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""
 
 
 def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None, *, max_streams: int = MAX_STREAMS,
-               set_stage: stage.Stage | None = None) -> FastAPI:
-    """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams, `set_stage`
-    takes captures at this machine."""
+               set_routes: Routes | None = None) -> FastAPI:
+    """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams, by
+    `set_routes` captures are taken at this machine."""
     app = FastAPI(title="Relit", version=__version__, description=DESCRIPTION, openapi_url="/v1/openapi.json",
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
@@ -62,9 +63,9 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                    uploads.options, jobs.router, events.router, results.router, results.pictures, hooks.router, operations.router):
         app.include_router(router)
     pages.install(app)
-    if set_stage is not None:
-        app.state.stage = set_stage
-        app.include_router(stage.router)
+    app.state.has_stage = set_routes is not None
+    if set_routes is not None:
+        app.include_router(set_routes, dependencies=[Depends(require_admin)])
         app.include_router(pages.set_router)
     app.add_middleware(middleware.Bodies)
     app.add_middleware(tus.TusHeaders)

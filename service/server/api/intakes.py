@@ -125,7 +125,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
             raise ApiError("conflict", f"{intake} is being checked")
 
         def work(connection: sa.Connection) -> list[str] | None:
-            if users := jobs.users_of(connection, intake, active=True):
+            if users := jobs.users_of(connection, intake):
                 raise ApiError("conflict", f"{intake} is read by {users[0]}, which has not ended")
             audit.record(connection, caller, "intake.delete", intake)
             return intakes.remove(connection, intake)

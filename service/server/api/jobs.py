@@ -22,6 +22,7 @@ from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.database import audit, idempotency, jobs, quotas
 from service.server.database.keys import Caller
+from service.server.jobs.queue import workflow_id
 from service.server.storage import layout
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
@@ -121,7 +122,7 @@ def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
     before = view(service, caller, job)
     if not audit.recorded(service.database, caller, "job.cancel", job, partial(jobs.cancel, job=job)):
         raise ApiError("conflict", f"{job} is {before.state}: it has ended")
-    service.queue.cancel(job, before.attempt)
+    service.queue.cancel(workflow_id(job, before.attempt))
     return view(service, caller, job)
 
 
@@ -160,7 +161,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     before = view(service, caller, job)
 
     def work(connection: sa.Connection) -> bool:
-        if users := jobs.users_of(connection, job, active=True):
+        if users := jobs.users_of(connection, job):
             raise ApiError("conflict", f"{job} is read by {users[0]}, which has not ended")
         return jobs.remove(connection, job)
 

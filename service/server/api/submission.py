@@ -22,6 +22,9 @@ from service.server.jobs.context import SEQUENCE
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")
 """Kinds of jobs that solve maps."""
+OF_RESULTS: dict[str, tuple[str, ...]] = {
+    "depth": ("depth",), "depths": ("depth",), "solves": (*SOLVES, "join"), "registered": ("register",), "golden": ("inspect-board",)}
+"""The kinds of jobs whose results a field of a job names; those of `maps` depend on the job."""
 OF_SEQUENCES = (asked.SolveJob, asked.DepthJob, asked.PipelineJob, asked.RelightJob, asked.ViewJob, TofCalibrationJob)
 """Jobs whose capture may be a sequence of captures."""
 KINDS_OF_SEQUENCES = [kind for kind, job in asked.JOBS.items() if issubclass(job, OF_SEQUENCES)]
@@ -63,27 +66,25 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
             if isinstance(request, asked.ViewJob):
                 _require_step(request, steps)
             read.append(identifier)
-    if isinstance(request, asked.RelightJob | asked.ShadeJob | asked.ExportJob | asked.ViewJob) and request.maps is not None:
-        kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, asked.ExportJob | asked.ViewJob) else ()))
-        of_sequences = request.step is not None if isinstance(request, asked.ViewJob) else not isinstance(request, asked.ShadeJob)
-        row = _require_results(service, project, "maps", request.maps, kinds, sequences=of_sequences)
+    if (maps := getattr(request, "maps", None)) is not None:
+        shown = ("depth",) if isinstance(request, asked.ExportJob | asked.ViewJob) else ()
+        kinds = SOLVES if isinstance(request, asked.JoinJob) else (*SOLVES, "join", *shown)
+        of_sequences = (request.step is not None if isinstance(request, asked.ViewJob) else
+                        isinstance(request, asked.RelightJob | asked.ExportJob))
+        row = _require_results(service, project, "maps", maps, kinds, sequences=of_sequences)
         if isinstance(request, asked.ViewJob) and request.step is not None and SEQUENCE not in row["finished_steps"]:
-            raise ApiError("invalid", f"maps: {request.maps} is of one capture, and {request.capture} is a sequence: give a job of it")
+            raise ApiError("invalid", f"maps: {maps} is of one capture, and {request.capture} is a sequence: give a job of it")
         if isinstance(request, asked.ExportJob) and SEQUENCE in row["finished_steps"]:
             _require_format(request.format)
-        read.append(request.maps)
-    if isinstance(request, asked.JoinJob):
-        _require_results(service, project, "maps", request.maps, SOLVES)
-        _require_results(service, project, "depth", request.depth, ("depth",))
-        read += [request.maps, request.depth]
-    if isinstance(request, asked.RegisterJob):
-        read += _require_scans(service, project, request)
-    if isinstance(request, asked.FuseJob):
-        row = _require_results(service, project, "registered", request.registered, ("register",))
-        read += [request.registered, *_require_scans(service, project, asked.RegisterJob.model_validate(row["request"]))]
-    if isinstance(request, asked.InspectBoardJob) and request.golden is not None:
-        _require_results(service, project, "golden", request.golden, (request.kind,))
-        read.append(request.golden)
+        read.append(maps)
+    for field, kinds in OF_RESULTS.items():
+        value = getattr(request, field, None) or ()
+        for name, identifier in ([(field, value)] if isinstance(value, str) else
+                                 [(f"{field}[{number}]", each) for number, each in enumerate(value)]):
+            row = _require_results(service, project, name, identifier, kinds)
+            read.append(identifier)
+            if isinstance(request, asked.FuseJob):
+                read += inputs_of(service, project, asked.RegisterJob.model_validate(row["request"]))
     if isinstance(request, asked.GaugeBoardJob):
         read += _require_inspections(service, project, request)
     return read
@@ -145,14 +146,6 @@ def _require_ready(service: Service, project: str, field: str, identifier: str) 
     if row["state"] != states.READY:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
     return row
-
-
-def _require_scans(service: Service, project: str, request: asked.RegisterJob) -> list[str]:
-    for number, identifier in enumerate(request.depths):
-        _require_results(service, project, f"depths[{number}]", identifier, ("depth",))
-    for number, identifier in enumerate(request.solves):
-        _require_results(service, project, f"solves[{number}]", identifier, (*SOLVES, "join"))
-    return [*request.depths, *request.solves]
 
 
 def _require_inspections(service: Service, project: str, request: asked.GaugeBoardJob) -> list[str]:

@@ -134,32 +134,33 @@ async def write_body(stream: AsyncIterator[bytes], writer: PartFileWriter) -> No
 
 
 class UploadPatch:
-    """A PATCH of an upload, whose part file is locked from `begin` to `close`.
+    """A PATCH of an upload, whose part file is locked until `close`.
 
     The methods wait for the disk or the database: call them from a thread.
     """
 
     def __init__(self, service: Service, caller: Caller, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
-        """Create the patch at the offset from which the client continues; `upload` is read again under the lock."""
-        self._service, self._caller = service, caller
-        self._row, self._offset, self._checksum = upload, offset, checksum
-        self._part: PartFile | None = None
+        """Lock the part file at the offset from which the client continues, and cut off bytes that were not counted."""
+        self._service, self._caller, self._row, self._checksum = service, caller, upload, checksum
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
-        self._saved = 0
-
-    def begin(self) -> None:
-        """Lock the part file and cut off bytes that were not counted."""
         try:
-            self._part = self._service.parts.open(self._row)
+            self._part = service.parts.open(upload)
         except PartFileLocked:
-            raise _locked(self._row) from None
-        being_written.add(self._row["id"])
-        self._row = row = self._still_there()
+            raise _locked(upload) from None
+        being_written.add(upload["id"])
+        try:
+            self._begin(offset)
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, offset: int) -> None:
+        self._row = row = self._still_there()  # as it is under the lock
         start = self._saved = safe_offset(row, self._part.size)
         if row["done"]:
             self._part.drop()  # opening it made an empty file
-        if self._offset != start:
-            raise ApiError("conflict", f"Upload-Offset: is {self._offset}, {start} bytes are here", headers={"Upload-Offset": str(start)})
+        if offset != start:
+            raise ApiError("conflict", f"Upload-Offset: is {offset}, {start} bytes are here", headers={"Upload-Offset": str(start)})
         if not row["done"]:
             require_space(self._service, FOR_UPLOAD)
             self._part.cut(start)
@@ -172,7 +173,6 @@ class UploadPatch:
 
     def end(self, broken: str | None) -> Row:
         """Verify and count the bytes that came, and return the row of the upload as it is now; `broken` says why the body did not end."""
-        assert self._part is not None
         if self._row["done"]:
             return self._row
         self.writer.settle()
@@ -198,7 +198,6 @@ class UploadPatch:
 
     def give_up(self) -> None:
         """Cut off bytes that were not counted; if the disk refuses that, the next PATCH does it."""
-        assert self._part is not None
         with contextlib.suppress(Exception):
             self.writer.settle()
         with contextlib.suppress(OSError):
@@ -206,9 +205,8 @@ class UploadPatch:
 
     def close(self) -> None:
         """Unlock the part file."""
-        if self._part is not None:
-            self._part.close()
-            being_written.discard(self._row["id"])
+        self._part.close()
+        being_written.discard(self._row["id"])
 
     def _guard(self) -> None:
         require_space(self._service, FOR_UPLOAD)
@@ -216,12 +214,10 @@ class UploadPatch:
 
     def _save(self, at: int) -> None:
         self._saved = at
-        assert self._part is not None
         if not self._service.parts.save(self._part, self._row["id"], at):
             self._gone()
 
     def _complete(self) -> None:
-        assert self._part is not None
         row, service = self._row, self._service
         if row["sha256"] is not None and self._sha256() != row["sha256"]:
             self._part.cut(0)
@@ -237,7 +233,6 @@ class UploadPatch:
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
     def _sha256(self) -> str:
-        assert self._part is not None
         whole = self._whole
         if whole is None:
             whole = hashlib.sha256()
@@ -249,7 +244,6 @@ class UploadPatch:
         return self._gone() if row is None else row
 
     def _gone(self) -> Row:
-        assert self._part is not None
         if uploads.find(self._service.database, self._row["id"], self._row["project"]) is not None:  # of another writer, now
             raise _locked(self._row)
         self._part.drop()

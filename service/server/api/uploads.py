@@ -109,8 +109,7 @@ async def patch_upload(
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    with closing(UploadPatch(service, caller, row, offset=offset, checksum=expected)) as patch:
-        await asyncio.to_thread(patch.begin)
+    with closing(await asyncio.to_thread(UploadPatch, service, caller, row, offset=offset, checksum=expected)) as patch:
         row = await _take(patch, request, row)
     response.headers.update(tus.state_headers(row, row["received"], service.settings.upload_hours))
 
@@ -193,7 +192,6 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
     if length == 0 and not row["done"]:
         with closing(UploadPatch(service, caller, row, offset=0, checksum=None)) as patch:
-            patch.begin()
             row = patch.end(None)
     view = _file_view(service, row)
     response.headers.update({"Location": f"/v1/uploads/{upload}", **tus.state_headers(row, view.received, service.settings.upload_hours)})

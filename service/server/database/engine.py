@@ -70,11 +70,6 @@ class Database:
         found = self.rows(query.limit(1), **parameters)
         return found[0] if found else None
 
-    def check(self) -> None:
-        """Raise DBAPIError if the database does not answer."""
-        with self.engine.connect() as connection:
-            connection.execute(sa.text("SELECT 1"))
-
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()

@@ -136,11 +136,11 @@ def frames(database: Database) -> int:
     return int((row and row["frames"]) or 0)
 
 
-def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[str]:
-    """Return the jobs, checks apart, that read a capture, an environment or a job; with `active`, those that have not ended."""
+def users_of(connection: sa.Connection, input_id: str) -> list[str]:
+    """Return the jobs, checks apart, that read a capture, an environment or a job and have not ended."""
     query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(
-        job_inputs.c.input == input_id, KIND != "check")
-    return list(connection.execute(query.where(jobs.c.state.in_(ACTIVE)) if active else query).scalars())
+        job_inputs.c.input == input_id, KIND != "check", jobs.c.state.in_(ACTIVE))
+    return list(connection.execute(query).scalars())
 
 
 def begin(database: Database, claim: Claim) -> bool:

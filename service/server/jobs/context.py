@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
@@ -21,27 +20,20 @@ from service.server.storage.objects import Storage
 class WorkerContext(NamedTuple):
     """Services and settings that the steps of a worker need."""
 
+    settings: Settings
     database: Database
     storage: Storage
-    cache: Path
-    """Folder of the image stacks, one for each capture."""
+    queue: JobQueue
+    """The queue in which other workers are asked to help."""
     device: str
-    max_pixels: int
-    roots_of: Callable[[str], tuple[Path, ...]]
-    """Returns the folders below which the registered captures and environments of a project lie."""
+    worker: str
+    """Name of the worker."""
     held: ExitStack = ExitStack()
     """Closes the folders of registered captures when a step ends."""
-    worker: str = ""
-    """Name of the worker."""
-    queue: JobQueue | None = None
-    """The queue in which other workers are asked to help; None: nobody is asked."""
-
-    settings: Settings | None = None
-    """The settings of the service, for its quotas and `min_free_bytes`; None: neither is looked at."""
 
     def require_space(self) -> None:
         """Raise RequestError if less than `min_free_bytes` are left in the data folder."""
-        if self.settings is not None and shutil.disk_usage(self.settings.data).free < self.settings.min_free_bytes:
+        if shutil.disk_usage(self.settings.data).free < self.settings.min_free_bytes:
             raise RequestError("the service has no space left for this job (min_free_bytes): retry it when there is")
 
 

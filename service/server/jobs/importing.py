@@ -34,7 +34,7 @@ def look(request: jobs.CheckJob, files: StepFiles) -> None:
     from service.captures.check_process import propose_in_process
 
     with _links(request.intake, files) as (folder, _):
-        proposal = propose_in_process(folder, max_pixels=files.context.max_pixels, progress=files.progress)
+        proposal = propose_in_process(folder, max_pixels=files.context.settings.max_pixels, progress=files.progress)
     intakes.propose(files.context.database, request.intake, proposal)
 
 
@@ -44,6 +44,7 @@ def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
     from service.captures.importing import still_assumed
 
     context, job, choices = files.context, files.job, request.importing
+    max_pixels = context.settings.max_pixels
     row = intakes.find(context.database, request.intake, job.project)
     if row is None or choices is None:
         raise RequestError(f"{request.intake}: is not there any more")
@@ -53,14 +54,13 @@ def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
     proposal = (row["facts"] or {}).get(intakes.PROPOSAL)
     with _links(request.intake, files) as (folder, given):
         import_in_process(folder, choices, () if proposal is None else still_assumed(proposal, choices), row["name"],
-                          max_pixels=context.max_pixels, progress=files.progress)
-        facts = check_in_process(folder, environment=False, root=None, max_pixels=context.max_pixels, progress=files.progress)
+                          max_pixels=max_pixels, progress=files.progress)
+        facts = check_in_process(folder, environment=False, root=None, max_pixels=max_pixels, progress=files.progress)
         made = _made(folder, given)
 
         def allow(connection: sa.Connection) -> None:
-            if context.settings is not None:
-                quotas.require(connection, context.settings, quotas.BYTES, job.project, sum(made.values()))
-                quotas.require(connection, context.settings, quotas.PIXELS, job.project, quotas.pixels_of(facts))
+            quotas.require(connection, context.settings, quotas.BYTES, job.project, sum(made.values()))
+            quotas.require(connection, context.settings, quotas.PIXELS, job.project, quotas.pixels_of(facts))
 
         def record(connection: sa.Connection) -> None:
             allow(connection)

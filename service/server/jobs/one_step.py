@@ -13,8 +13,11 @@ from service.reporting.provenance import name_place
 from service.requests import calibrate, calibration_jobs, jobs
 from service.requests.base.base import JobRequest, Options
 from service.requests.basis import BasisKind
-from service.requests.depth import SeparateRequest
-from service.requests.light.light_keys import LightKeys
+from service.requests.chart import ChartRequest
+from service.requests.depth import ScanRequest, SeparateRequest
+from service.requests.drive import DriveRequest
+from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+from service.requests.rig import RigCalibrationRequest
 from service.requests.shade import ShadeRequest
 from service.requests.solve import JoinRequest
 from service.server.jobs.places import StepFiles, file_within
@@ -25,21 +28,21 @@ from stage.files import write_text
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""
-RIG_FILE, KEYS_FILE, CHART_FILE = "rig.json", "keys.json", "chart.json"
-"""Names of the files with the rig and the light keys of a job, which lie beside what was made of them."""
 MEASURED_FILE = "measured.json"
-REGIONS_FILE = "regions.json"
-"""Name of the file with the regions of a job, which lies beside what they were judged in."""
+"""Name of the file of a rig whose lamps were measured."""
 STUDY_FILE = "study.json"
 TOF_FILE = "tof.json"
 """Name of the calibration of a time-of-flight camera."""
 
 
-def _product(function: str, model: type[Options], file: str = "", **given: Any) -> Callable[[JobRequest, StepFiles], None]:
-    """Return the function of jobs whose product, a `module:function` that is loaded when it is called, is given nothing but its request."""
-    def make(request: JobRequest, files: StepFiles) -> None:
+def _product(function: str, model: type[Options], file: str = "", *, capture_as: str | None = None, **given: Any
+             ) -> Callable[[Any, StepFiles], None]:
+    """Return the function of jobs whose product, a `module:function` that is loaded when it is called, is given nothing but its request.
+    `capture_as`: the field for the folder of the job's capture, where the request of the product has another word for it."""
+    def make(request: Any, files: StepFiles) -> None:
         module, _, name = function.partition(":")
-        getattr(import_module(module), name)(files.request(model, request, out=files.out / file, **given), files.progress)
+        captured = {} if capture_as is None else {capture_as: files.intake(request.capture)}
+        getattr(import_module(module), name)(files.request(model, request, out=files.out / file, **captured, **given), files.progress)
 
     return make
 
@@ -75,13 +78,6 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
                             device=files.device, cache=files.cache(request.capture), **options), files.progress)
 
 
-def _scan(request: jobs.ScanJob, files: StepFiles) -> None:
-    from service.depth.scan import scan
-    from service.requests.depth import ScanRequest
-
-    scan(files.request(ScanRequest, request, scan=files.intake(request.capture), out=files.out), files.progress)
-
-
 def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
     from service.depth.patterns.projection import make_patterns
     from service.requests.patterns import PatternsRequest
@@ -90,40 +86,8 @@ def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
     make_patterns(PatternsRequest(out=files.out, **options), files.progress)
 
 
-def _inspect_board(request: jobs.InspectBoardJob, files: StepFiles) -> None:
-    from service.boards.inspect_board import inspect_board
-    from service.requests.inspect_board import InspectBoardRequest
-
-    regions = None
-    if request.regions is not None:
-        regions = files.out / REGIONS_FILE
-        write_text(regions, request.regions.model_dump_json(by_alias=True, indent=2) + "\n")
-    inspect_board(files.request(InspectBoardRequest, request, board=files.intake(request.capture), out=files.out, regions=regions),
-                  files.progress)
-
-
-def _drive(request: jobs.DriveJob, files: StepFiles) -> None:
-    from service.drive.drive import drive
-    from service.requests.drive import DriveRequest
-
-    given: dict[str, Path | None] = {"rig": files.out / RIG_FILE, "chart": None if request.chart is None else files.out / CHART_FILE}
-    for path, document in zip(given.values(), (request.rig, request.chart), strict=True):
-        if path is not None and document is not None:
-            write_text(path, document.model_dump_json(by_alias=True) + "\n")
-    drive(files.request(DriveRequest, request, **given, keys=write_keys(request.keys, files), out=files.out), files.progress)
-
-
-def write_keys(keys: LightKeys | None, files: StepFiles) -> Path | None:
-    """Write the light keys of a job among its results and return their file, or None if it has none."""
-    if keys is None:
-        return None
-    write_text(files.out / KEYS_FILE, keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
-    return files.out / KEYS_FILE
-
-
 def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
     from service.boards.gauge_board import gauge_board
-    from service.requests.inspect_board import GaugeBoardRequest
 
     with tempfile.TemporaryDirectory(prefix="relit-gauge-") as made:
         folder = Path(made)
@@ -132,16 +96,6 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
             (folder / run.result).symlink_to(files.maps(run.result), target_is_directory=True)
         write_text(folder / STUDY_FILE, request.study.model_dump_json(by_alias=True))
         gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress)
-
-
-def _calibrate_chart(request: calibration_jobs.ChartJob, files: StepFiles) -> None:
-    from service.calibrate.chart import calibrate_chart
-    from service.requests.chart import ChartRequest
-
-    folder = files.intake(request.capture)
-    reflectances = None if request.reflectances is None else file_within(folder, request.reflectances, "reflectances")
-    calibrate_chart(files.request(ChartRequest, request, capture=folder, reflectances=reflectances, out=files.out / FILE_NAME),
-                    files.progress)
 
 
 def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.StereoCalibrationJob | calibration_jobs.LaserPlanesJob,
@@ -156,19 +110,6 @@ def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.Stereo
         stereo.stereo(files.request(calibrate.StereoRequest, request), files.progress, manifest_paths=paths)
     else:
         laser_planes.laser_planes(files.request(calibrate.LaserPlanesRequest, request), files.progress, manifest_paths=paths)
-
-
-def _calibrate_lamps(request: calibration_jobs.RigCalibrationJob, files: StepFiles) -> None:
-    from service.calibrate.rig_lamps import calibrate_rig
-    from service.requests.rig import RigCalibrationRequest
-
-    rig = files.out / RIG_FILE
-    write_text(rig, request.rig.model_dump_json(by_alias=True) + "\n")
-    folder = files.intake(request.capture)
-    table = file_within(folder, request.table, "table")
-    reflectances = None if request.reflectances is None else file_within(folder, request.reflectances, "reflectances")
-    calibrate_rig(files.request(RigCalibrationRequest, request, rig=rig, table=table, reflectances=reflectances,
-                                out=files.out / MEASURED_FILE, capture=folder), files.progress)
 
 
 def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles) -> None:
@@ -197,10 +138,14 @@ ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] =
                                                          FILE_NAME)),
     calibration_jobs.ResponseJob: (MEASURE, _product("service.calibrate.response:response", calibrate.ResponseRequest, FILE_NAME)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
-    calibration_jobs.RigCalibrationJob: (MEASURE, _calibrate_lamps), calibration_jobs.ChartJob: (MEASURE, _calibrate_chart),
+    calibration_jobs.RigCalibrationJob: (MEASURE, _product("service.calibrate.rig_lamps:calibrate_rig", RigCalibrationRequest,
+                                                           MEASURED_FILE)),
+    calibration_jobs.ChartJob: (MEASURE, _product("service.calibrate.chart:calibrate_chart", ChartRequest, FILE_NAME)),
     jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _product("service.joining.join:join", JoinRequest)),
     jobs.ShadeJob: ("shade", _product("service.relight.shade:shade", ShadeRequest, layout.PICTURE)), jobs.ViewJob: ("view", _view),
-    jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _drive),
-    jobs.BasisJob: (MEASURE, _basis), jobs.ScanJob: (MEASURE, _scan), jobs.PatternsJob: (MEASURE, _patterns),
+    jobs.InspectBoardJob: ("inspect", _product("service.boards.inspect_board:inspect_board", InspectBoardRequest, capture_as="board")),
+    jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _product("service.drive.drive:drive", DriveRequest)),
+    jobs.BasisJob: (MEASURE, _basis), jobs.PatternsJob: (MEASURE, _patterns),
+    jobs.ScanJob: (MEASURE, _product("service.depth.scan:scan", ScanRequest, capture_as="scan")),
     jobs.SeparateJob: (MEASURE, _product("service.depth.separate:separate", SeparateRequest))}
 """The name of the step of each of these kinds of jobs, and the function that does it."""

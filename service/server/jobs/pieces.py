@@ -66,9 +66,8 @@ class JobPieces:
 
     def invite(self, pieces: int) -> None:
         """Ask workers that have no other work to help with the job, no more than there are pieces beside that of this worker."""
-        queue, missing = self._context.queue, self._missing(pieces)
-        if queue is not None and missing > 0:
-            queue.ask_for_help(self._job.id, self._job.attempt, self._job.request.priority, missing, self._job.project)
+        if (missing := self._missing(pieces)) > 0:
+            self._context.queue.ask_for_help(self._job.id, self._job.attempt, self._job.request.priority, missing, self._job.project)
             self._invited += missing
 
     def invite_to_steps(self, steps: int) -> None:
@@ -78,8 +77,6 @@ class JobPieces:
             self.invite(steps)
 
     def _missing(self, pieces: int) -> int:
-        if self._context.queue is None or pieces < 2:
-            return 0
         others = {row["id"] for row in workers.seen_lately(self._context.database)} - {self._context.worker}
         return min(len(others), pieces - 1) - self._invited
 
@@ -123,9 +120,8 @@ class JobPieces:
         self._context.storage.remove(self._prefix)
 
     def _at_work(self) -> set[str]:
-        queue = self._context.queue
         seen = {row["id"] for row in workers.seen_lately(self._context.database)}
-        return seen if queue is None else seen & queue.workers_on(self._job.id)
+        return seen & self._context.queue.workers_on(self._job.id)
 
 
 def is_running(context: WorkerContext, job: Job) -> bool:

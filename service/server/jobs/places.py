@@ -5,6 +5,8 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from pydantic import BaseModel
+
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
@@ -20,8 +22,9 @@ from stage.files import resolved, write_text
 
 ANNOTATIONS_FILE = "annotations.json"
 R = TypeVar("R", bound=Options)
-NAMES = ("images", "masks", "dark_images")
-"""Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers."""
+NAMES = ("images", "masks", "dark_images", "reflectances", "table")
+"""Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers, or a JSON
+document."""
 
 
 class StepFiles(NamedTuple):
@@ -38,28 +41,34 @@ class StepFiles(NamedTuple):
 
     def cache(self, capture: str) -> Path:
         """Return the folder of the image stack of a capture."""
-        return self.context.cache / capture
+        return self.context.settings.cache / capture
 
     def request(self, model: type[R], job: JobRequest, **given: Any) -> R:
         """Return the request of a product: values `given`, options of a job, and folders and files for its identifiers and names."""
         values = {**dict(getattr(job, "options", ())), **given}
         for name in type(job).model_fields:
             if name in model.model_fields and name not in JobRequest.model_fields and name not in values:
-                value = getattr(job, name)
-                values[name] = (tuple(file_within(values["capture"], each, name) for each in value) if name in NAMES
-                                else self._place(value))
+                values[name] = self._place(name, getattr(job, name), values.get("capture"))
         capture = next(iter(getattr(job, "captures", ())), getattr(job, "capture", None))
         ours = {"device": self.device, "cache": None if capture is None else self.cache(capture)}
         return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
 
-    def _place(self, identified: Any) -> Any:
-        if identified is None:
+    def _place(self, field: str, value: Any, capture: Path | None) -> Any:
+        """Return the file or folder that the value of a job's field stands for; a document is written as FIELD.json among the results."""
+        if value is None:
             return None
-        if isinstance(identified, tuple):
-            return tuple(map(self._place, identified))
-        if identified.startswith(ENVIRONMENT):
-            return self.environment_image(identified)
-        return self.intake(identified) if identified.startswith(CAPTURE) else self.maps(identified)
+        if isinstance(value, tuple):
+            return tuple(self._place(field, each, capture) for each in value)
+        if isinstance(value, BaseModel):
+            path = self.out / f"{field}.json"
+            write_text(path, value.model_dump_json(by_alias=True, indent=2, exclude_defaults=True) + "\n")
+            return path
+        if field in NAMES:
+            assert capture is not None, "it is a field of all jobs with such names"
+            return file_within(capture, value, field)
+        if value.startswith(ENVIRONMENT):
+            return self.environment_image(value)
+        return self.intake(value) if value.startswith(CAPTURE) else self.maps(value)
 
     @property
     def out(self) -> Path:
@@ -80,9 +89,9 @@ class StepFiles(NamedTuple):
 
         folder, root = self.intake_place(identifier)
         if root is not None and identifier.startswith(CAPTURE):
-            recheck_capture(folder, max_pixels=self.context.max_pixels, number=number)
+            recheck_capture(folder, max_pixels=self.context.settings.max_pixels, number=number)
         elif root is not None:
-            admit_environment(folder, max_pixels=self.context.max_pixels)
+            admit_environment(folder, max_pixels=self.context.settings.max_pixels)
         return folder
 
     def intake_place(self, identifier: str) -> tuple[Path, Path | None]:
@@ -94,11 +103,11 @@ class StepFiles(NamedTuple):
         if row["folder"] is None:
             return _named(context.storage.local(layout.intake(project, identifier), progress=self.progress), identifier), None
         folder = Path(row["folder"])
-        root = next((root for root in context.roots_of(project) if folder.is_relative_to(root)), None)
+        root = next((root for root in context.settings.roots_of(project) if folder.is_relative_to(root)), None)
         if resolved(folder) != folder or root is None:
             raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
         top = folder if identifier.startswith(CAPTURE) else folder.parent
-        context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
+        context.held.enter_context(inputs.confined(top, root, max_pixels=context.settings.max_pixels))
         return _named(folder, identifier), root
 
     def write_annotations(self, source: str) -> None:
@@ -131,9 +140,9 @@ def file_within(capture: Path, name: str, field: str) -> Path:
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:
     """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know."""
-    names = {f"{context.cache.parent}/": ""}
+    names = {f"{context.settings.data}/": ""}
     for row in intakes.read_by(context.database, job):
-        names |= {f"{root}/": "" for root in context.roots_of(row["project"])}
+        names |= {f"{root}/": "" for root in context.settings.roots_of(row["project"])}
         if row["folder"] is not None:
             names[row["folder"]] = row["id"] if row["kind"] == CAPTURE else Path(row["folder"]).name
     for place in sorted(names, key=len, reverse=True):

@@ -81,9 +81,9 @@ class JobQueue:
         """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays."""
         set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
 
-    def cancel(self, job: str, attempt: int) -> None:
-        """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
-        self._client.cancel_workflow(workflow_id(job, attempt))
+    def cancel(self, workflow: str) -> None:
+        """Take an attempt or a help out of the queue; a worker that has it learns so from the job's row at its next sign of progress."""
+        self._client.cancel_workflow(workflow)
 
     def ask_for_help(self, job: str, attempt: int, priority: int, workers: int, project: str) -> None:
         """Queue work for workers that have no other: to help with a job that another worker does."""
@@ -100,10 +100,6 @@ class JobQueue:
         """Return the names of the workers that do a job or help with it."""
         return {worker for worker, workflows in self.taken_by().items() if any(name.startswith(f"{job}.") for name in workflows)}
 
-    def end_help(self, workflow: str) -> None:
-        """Queue the help of a worker that died no more: the worker that has the job does what is left."""
-        self._client.cancel_workflow(workflow)
-
     def taken_by(self) -> dict[str, list[str]]:
         """Return the workflows that have begun and not ended, by the worker that has them."""
         found: dict[str, list[str]] = {}
@@ -113,14 +109,11 @@ class JobQueue:
 
     def return_job(self, workflow: str, worker: str) -> None:
         """Queue a workflow again that the calling worker had taken and does not finish."""
-        if is_help(workflow):
-            self.end_help(workflow)
-            return
-        job, attempt = job_and_attempt(workflow)
-        if self._database.transact(lambda connection: jobs.release(connection, Claim(job, attempt, worker))):
+        claim = Claim(*job_and_attempt(workflow), worker)
+        if not is_help(workflow) and self._database.transact(lambda connection: jobs.release(connection, claim)):
             self.requeue(workflow)
-        else:
-            self.cancel(job, attempt)
+        else:  # also of help, as the worker that has the job does what is left
+            self.cancel(workflow)
 
     def requeue(self, workflow: str) -> None:
         """Queue a workflow again that a worker had taken; its place in the queue is the one that it had."""

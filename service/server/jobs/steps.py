@@ -12,7 +12,7 @@ from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
 from service.server.jobs import importing, scan_sets, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.one_step import ONE_STEP, export, write_keys
+from service.server.jobs.one_step import ONE_STEP, export
 from service.server.jobs.places import StepFiles
 from service.server.storage import layout
 
@@ -28,7 +28,7 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         def step(progress: Progress) -> None:
             with held:
                 if not isinstance(job.request, jobs.CheckJob):  # which does not decode, and may run beside another step
-                    decoders = Decoders(context.max_pixels)
+                    decoders = Decoders(context.settings.max_pixels)
                     held.callback(decoders.close)
                     held.enter_context(images.decoded_by(decoders))
                 run(progress)
@@ -81,16 +81,15 @@ def _frames(job: Job, request: jobs.RelightJob, context: WorkerContext) -> list[
 def _check(request: jobs.CheckJob, files: StepFiles) -> None:
     from service.captures.check_process import check_in_process
 
-    context, project = files.context, files.job.project
+    context, settings = files.context, files.context.settings
     importing.delete_strays(request.intake, files)
     folder, root = files.intake_place(request.intake)
-    facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
+    facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=settings.max_pixels,
                              progress=files.progress)
     if root is not None and (what := "scan" if "shots" in facts else "board" if "tiles" in facts else None) is not None:
         raise RequestError(f"a {what} is not registered: upload its folder")
-    settings, more = context.settings, quotas.pixels_of(facts)
-    intakes.accept(context.database, request.intake, facts, None if settings is None else lambda connection: quotas.require(
-        connection, settings, quotas.PIXELS, project, more))
+    intakes.accept(context.database, request.intake, facts, lambda connection: quotas.require(
+        connection, settings, quotas.PIXELS, files.job.project, quotas.pixels_of(facts)))
 
 
 def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> None:
@@ -98,7 +97,7 @@ def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> No
     from service.requests.relight import RelightRequest
 
     out = files.out
-    wanted = files.request(RelightRequest, request, keys=write_keys(request.keys, files), out=str(out / layout.FRAMES))
+    wanted = files.request(RelightRequest, request, out=str(out / layout.FRAMES))
     for part in _parts(chunk, out) if files.job.is_resumed else [chunk]:
         relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress)
 

@@ -101,15 +101,12 @@ class Takeover:
 
     def _take(self, workflow: str, worker: str) -> None:
         """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
-        if is_help(workflow):
-            self._queue.end_help(workflow)
-            return
-        job, attempt = job_and_attempt(workflow)
-        state = self._database.transact(lambda connection: jobs.record_lost_worker(connection, Claim(job, attempt, worker), self._max_lost))
-        if state == QUEUED:
+        claim = Claim(*job_and_attempt(workflow), worker)
+        if not is_help(workflow) and self._database.transact(
+                lambda connection: jobs.record_lost_worker(connection, claim, self._max_lost)) == QUEUED:
             self._queue.requeue(workflow)
-        else:
-            self._queue.cancel(job, attempt)
+        else:  # also of help, as the worker that has the job does what is left
+            self._queue.cancel(workflow)
 
     def _return_forgotten(self, workflows: list[str]) -> None:
         unknown = set(workflows) - self._running()

@@ -49,8 +49,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
-    context = WorkerContext(database, open_storage(settings), settings.cache, device, settings.max_pixels, settings.roots_of,
-                            worker=name, queue=queue, settings=settings)
+    context = WorkerContext(settings, database, open_storage(settings), queue, device, name)
     runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,

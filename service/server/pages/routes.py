@@ -21,7 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from starlette.types import Scope
 
 from service import __version__
-from service.requests.base.identifiers import CaptureId, JobId
+from service.requests.base.identifiers import CAPTURE, JOB, CaptureId, JobId, pattern
 from service.requests.base.import_choices import Layout
 from service.requests.jobs import JOBS
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, Form, form_of, import_fields
@@ -92,25 +92,32 @@ def modules_of(module: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-templates.globals["modules_of"] = modules_of
+templates.globals.update(modules_of=modules_of, next_steps=NEXT_STEPS)
 
 
-@router.get("/")
-async def home(request: Request) -> Response:
-    """Show captures, assets and environments as cards, and the jobs above them."""
-    return _page(request, "home.html")
+def _add_page(address: str, template: str, *, to: APIRouter = router) -> None:
+    """Add a page whose modules ask the API for all that they show."""
+    @to.get(address)
+    async def page(request: Request) -> Response:
+        return _page(request, template)
 
 
-@router.get("/captures")
-async def captures(request: Request) -> Response:
-    """Show the captures and environments, and take new ones."""
-    return _page(request, "captures.html")
+def _add_page_of(kind: str, prefix: str, address: str, template: str) -> None:
+    """Add such a page of one capture or job, whose identifier ends its address; `kind` is the word for it."""
+    @router.get(f"{address}/{{{kind}}}")
+    async def page(request: Request, identifier: Annotated[str, PathParameter(alias=kind, pattern=pattern(prefix))]) -> Response:
+        return _page(request, template, identifier=identifier)
 
 
-@router.get("/machines")
-async def machines(request: Request) -> Response:
-    """Show an operator the workers, what waits for them, the space left, and who did what."""
-    return _page(request, "machines.html")
+_add_page("/", "home.html")  # captures, assets and environments as cards, and the jobs above them
+_add_page("/captures", "captures.html")  # captures and environments, and new ones
+_add_page("/machines", "machines.html")  # for an operator: the workers, what waits for them, the space left, and who did what
+_add_page("/set", "set.html", to=set_router)  # takes captures at the stage of this machine
+_add_page_of("capture", CAPTURE, "/light", "light.html")  # relit live
+_add_page_of("capture", CAPTURE, "/object", "object.html")  # what was captured and what was made of it, as modes of one view
+_add_page_of("job", JOB, "/maps", "maps.html")  # the maps that it has solved or decoded
+_add_page_of("job", JOB, "/asset", "asset.html")  # the asset that it has exported
+_add_page_of("job", JOB, "/drive", "drive.html")  # the levels of the lamps that it has driven
 
 
 @router.get("/captures/{capture}")
@@ -119,7 +126,7 @@ async def capture(request: Request, capture: CaptureId) -> Response:
     forms: dict[str, list[Form]] = {"Make something else": [], "Calibrate": []}
     for kind, model in CAPTURE_JOBS.items():
         forms["Calibrate" if kind.startswith("calibrate-") else "Make something else"].append(form_of(kind, model))
-    return _page(request, "capture.html", identifier=capture, next_steps=NEXT_STEPS, forms=forms)
+    return _page(request, "capture.html", identifier=capture, forms=forms)
 
 
 @router.get("/import-form/{layout}")
@@ -147,42 +154,6 @@ async def form_words(kind: JobKind) -> list[dict[str, Any]]:
     return [{"paths": field.paths, "label": field.label, "default": field.default} for field in (*form.main, *form.more)]
 
 
-@router.get("/light/{capture}")
-async def light(request: Request, capture: CaptureId) -> Response:
-    """Relight a capture live."""
-    return _page(request, "light.html", identifier=capture)
-
-
-@router.get("/object/{capture}")
-async def object_page(request: Request, capture: CaptureId) -> Response:
-    """Show what was captured and what was made of it, as modes of one view."""
-    return _page(request, "object.html", identifier=capture, next_steps=NEXT_STEPS)
-
-
-@router.get("/maps/{job}")
-async def maps(request: Request, job: JobId) -> Response:
-    """Show the maps that a job has solved or decoded."""
-    return _page(request, "maps.html", identifier=job)
-
-
-@router.get("/asset/{job}")
-async def asset(request: Request, job: JobId) -> Response:
-    """Show the asset that a job has exported."""
-    return _page(request, "asset.html", identifier=job)
-
-
-@router.get("/drive/{job}")
-async def drive(request: Request, job: JobId) -> Response:
-    """Show the levels of the lamps that a job has driven."""
-    return _page(request, "drive.html", identifier=job)
-
-
-@set_router.get("/set")
-async def stage(request: Request) -> Response:
-    """Take captures at the stage of this machine."""
-    return _page(request, "set.html")
-
-
 def wants_page(request: Request) -> bool:
     """Return whether a browser goes to an address, and so is answered with a page; a program names no HTML among what it accepts."""
     return request.method in ("GET", "HEAD") and "text/html" in request.headers.get("Accept", "")
@@ -205,5 +176,5 @@ async def icon(request: Request) -> Response:
 
 
 def _page(request: Request, template: str, **values: Any) -> Response:
-    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), here=request.url.path, **values)
+    text = templates.get_template(template).render(has_stage=request.app.state.has_stage, here=request.url.path, **values)
     return Response(text, media_type="text/html", headers=HEADERS)

@@ -16,7 +16,7 @@ import shutil
 import sqlite3
 import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -44,14 +44,6 @@ PROJECTS = "projects"
 """Folder of captures and results, in the data folder and in the backup, and prefix of their objects."""
 TRIES = 5
 """Times that an object is fetched that is replaced meanwhile."""
-
-
-class Differences(NamedTuple):
-    """Objects of a backup that the store has no longer as they were."""
-
-    missing: list[str]
-    changed: list[str]
-    """Objects with another size or another ETag."""
 
 
 def present(bucket: Bucket, *, pieces: bool) -> dict[str, Object]:
@@ -87,20 +79,6 @@ def save(bucket: Bucket, folder: Path) -> dict[str, Object]:
 
     with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-backup") as pool:
         return {found.path: found for found in pool.map(fetch, present(bucket, pieces=True).values()) if found is not None}
-
-
-def compare(bucket: Bucket, wanted: Mapping[str, tuple[int, str]]) -> Differences:
-    """Compare the objects of the store with those of a backup, each with its size and ETag."""
-    found = present(bucket, pieces=True)
-    return Differences([path for path in wanted if path not in found],
-                       [path for path, entry in wanted.items() if path in found and (found[path].size, found[path].version) != entry])
-
-
-def send(bucket: Bucket, folder: Path, paths: list[str]) -> None:
-    """Send copies into the store."""
-    with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-restore") as pool:
-        for _ in pool.map(lambda path: bucket.send(folder / path, path, lambda: None), paths):
-            pass
 
 
 SCHEMA = "relit.backup/1"
@@ -151,16 +129,13 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     else:
         _postgres(settings, "pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--file={out / DUMP}")
     found = {name: _entry(out / name) for name in (SQLITE, DUMP) if (out / name).exists()}
-    if settings.storage_url is None:
-        for path in _files(settings.data / PROJECTS):
+    part_files = part_files_folder(settings)
+    for folder in (part_files,) if settings.storage_url is not None else (settings.data / PROJECTS, part_files):
+        keep = _copy if folder == part_files else _link  # a client may add to part files meanwhile
+        for path in _files(folder):
             name = path.relative_to(settings.data).as_posix()
-            if _link(path, out / name):
+            if keep(path, out / name):
                 found[name] = _entry(out / name)
-    folder = part_files_folder(settings)
-    for path in _files(folder):  # a client may add to them meanwhile, so they are copied
-        name = path.relative_to(settings.data).as_posix()
-        if _copy(path, out / name):
-            found[name] = _entry(out / name)
     contents: dict[str, Any] = {"schema": SCHEMA, "version": __version__, "at": at, "files": found}
     objects: dict[str, Object] = {}
     if bucket is not None:
@@ -230,9 +205,13 @@ def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str
         raise RequestError(f"{folder}: is of a service with storage_url {stored['url']}: give this one, or another"
                            f"{'' if stored['copied'] else ' with the same objects'}")
     bucket, wanted = Bucket(settings.storage_url), stored["objects"]
-    missing, changed = compare(bucket, {path: (entry["size"], entry["version"]) for path, entry in wanted.items()})
+    found = present(bucket, pieces=True)
+    missing = [path for path in wanted if path not in found]
+    changed = [path for path, entry in wanted.items()
+               if path in found and (found[path].size, found[path].version) != (entry["size"], entry["version"])]
     if stored["copied"]:
-        send(bucket, folder / OBJECTS, [*missing, *changed])
+        with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-restore") as pool:
+            list(pool.map(lambda path: bucket.send(folder / OBJECTS / path, path, lambda: None), [*missing, *changed]))
     else:
         changed = [path for path in changed if not wanted[path].get("changes")]  # its job went on after the backup
         if (missing or changed) and not accept_differences:

@@ -167,7 +167,7 @@ class Housekeeper:
             total -= 0 if there[name].exists() else sizes[name]
 
     def _clear_unread(self, cache: Path) -> None:
-        if not self._database.transact(partial(jobs.users_of, input_id=cache.name, active=True)):
+        if not self._database.transact(partial(jobs.users_of, input_id=cache.name)):
             _clear(cache)
 
     def _leftovers(self) -> None:
@@ -188,7 +188,7 @@ class Housekeeper:
 
 
 def _forget(connection: sa.Connection, job: str) -> bool:
-    return not jobs.users_of(connection, job, active=True) and jobs.remove(connection, job)
+    return not jobs.users_of(connection, job) and jobs.remove(connection, job)
 
 
 def _clear(folder: Path) -> None:

@@ -17,8 +17,7 @@ import uvicorn
 from anyio import to_thread
 
 from service.errors import RequestError
-from service.server.api.app import create_app
-from service.server.api.stage import Stage
+from service.server.api.app import Routes, create_app
 from service.server.base import telemetry
 from service.server.base.log import logger
 from service.server.base.settings import Settings
@@ -39,9 +38,9 @@ go as it happens, and take 60 KB each."""
 
 
 def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None,
-          set_stage: Stage | None = None) -> None:
+          set_routes: Routes | None = None) -> None:
     """Serve until SIGTERM or SIGINT, then let steps and requests end.
-    `before_answering`: gets the address and the parts of the service. `set_stage`: takes captures at this machine, for the page /set.
+    `before_answering`: gets the address and the parts of the service. `set_routes`: take captures at this machine, for the page /set.
     Raises RequestError: the service cannot listen."""
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
@@ -52,14 +51,14 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     supervisor = Supervisor(settings, devices.of_workers(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)
-    app = create_app(settings, database, tracing, max_streams=limits.connections // 2, set_stage=set_stage)
+    app = create_app(settings, database, tracing, max_streams=limits.connections // 2, set_routes=set_routes)
     server = http_server(app, settings, limits)
     housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
     sender = HookSender(settings, database)
     address = _address(settings.host, listening.getsockname()[1])
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
-    if set_stage is not None:
+    if set_routes is not None:
         print(f"set      {address}/set", flush=True)
     if before_answering is not None:
         before_answering(address, database, app.state.service.queue, app.state.service.storage)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire
+from service.acquisition.cameras import aravis_camera
 from service.acquisition.cameras.aravis_camera import FORMATS, LIBRARY
 from service.acquisition.cameras.camera import NoPictureError, Setup, open_camera
 from service.acquisition.cameras.gphoto2_camera import seconds_of
@@ -148,7 +149,8 @@ def test_the_camera_that_aravis_feigns_takes_pictures_at_exposures(tmp_path):
 
 
 def test_without_aravis_its_package_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.acquisition.cameras.aravis_camera._library", lambda: None)
+    monkeypatch.setattr(aravis_camera, "_library", aravis_camera._library.__wrapped__)
+    monkeypatch.setattr(aravis_camera, "LIBRARY", "of-no-such-name")
     with pytest.raises(RequestError, match="apt install libaravis"):
         open_camera("aravis:Fake_1", Setup(tmp_path / "spool", 5.0, (), None))
 

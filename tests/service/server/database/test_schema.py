@@ -73,7 +73,7 @@ def test_yesterdays_database_is_upgraded_and_keeps_all_it_has(settings, yesterda
     assert [row["id"] for row in jobs.latest(yesterday, "larch", limit=9)] == [WAITING, DONE]
     waiting = jobs.find(yesterday, WAITING, "larch")
     assert (waiting["state"], waiting["attempt"], waiting["lost"], waiting["priority"]) == ("queued", 2, 2, 60)
-    assert yesterday.transact(lambda connection: jobs.users_of(connection, CAPTURE, active=True)) == [WAITING]
+    assert yesterday.transact(lambda connection: jobs.users_of(connection, CAPTURE)) == [WAITING]
     assert yesterday.row(sa.select(tables.idempotency.c.made))["made"] == DONE
     assert [row["object"] for row in audit.listing(yesterday, limit=9)] == [DONE]
     assert [row["text"] for row in jobs.log_of(yesterday, DONE)] == ["succeeded"]

@@ -20,8 +20,10 @@ from service.requests.relight import RelightOptions
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
+from service.server.jobs.context import WorkerContext
 from service.server.jobs.queue import JobQueue, workflow_id
 from service.server.storage import layout
+from service.server.storage.objects import open_storage
 from tests.service.server.prepared import prepare
 from tests.service.server_process import JsonLog, environment_with
 from tests.service.waiting import until
@@ -48,6 +50,11 @@ class Harness:
         self.events = JsonLog(self.log, b"{").lines
         self._environment = environment_with(**settings, **({} if database_url is None else {"database_url": database_url}))
         self.supervisors: list[subprocess.Popen[bytes]] = []
+
+    def context(self, **changed: Any) -> WorkerContext:
+        """What the steps of a worker in this process get, with some settings changed."""
+        settings = self.settings.model_copy(update=changed)
+        return WorkerContext(settings, self.database, open_storage(settings), self.queue, "cpu", "")
 
     def start(self, **environment: str) -> subprocess.Popen[bytes]:
         """Another `relit worker`, in a process group of its own."""

@@ -9,7 +9,7 @@ from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
 from service.requests.base.import_choices import ImportChoices
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, uploads
-from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.context import Job
 from service.server.jobs.steps import steps_of
 from service.server.storage import layout
 from service.server.storage.folder import FolderStorage
@@ -44,9 +44,8 @@ def uploaded(idle_harness, tmp_path):
 
 
 def run(harness, identifier, choices=CHOICES, **settings):
-    context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 1 << 20,
-                            lambda project: (), settings=harness.settings.model_copy(update=settings))
-    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=choices), 1), context)
+    job = Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=choices), 1)
+    step, = steps_of(job, harness.context(**settings))
     step.run(SILENT)
 
 

@@ -12,7 +12,7 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module
-from service.server.jobs.context import JobStep, WorkerContext
+from service.server.jobs.context import JobStep
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
@@ -29,9 +29,7 @@ NAMES = ["frames 1-5", "frames 6-10"]
 def runner(idle_harness, monkeypatch):
     """A worker `one` that has taken a job of two steps."""
     monkeypatch.setattr(runner_module, "FIRST_PAUSE_S", 0.0)
-    context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1,
-                            idle_harness.settings.roots_of)
-    made = JobRunner(context, "one", alive=lambda oldest: None)
+    made = JobRunner(idle_harness.context(), "one", alive=lambda oldest: None)
     job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
     idle_harness.take(job, "one")
     return made, Claim(job, 1, "one")

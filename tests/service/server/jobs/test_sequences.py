@@ -56,8 +56,8 @@ def solve_of(harness, sequence, **options) -> Job:
 
 
 def context_of(harness, settings: Settings, sequence) -> WorkerContext:
-    return WorkerContext(harness.database, open_storage(settings), settings.data / "cache", "cpu", 4096,
-                         lambda project: (sequence.parent,))
+    settings = settings.model_copy(update={"roots": (sequence.parent,)})
+    return harness.context()._replace(settings=settings, storage=open_storage(settings))
 
 
 def run(job: Job, context: WorkerContext, name: str) -> None:

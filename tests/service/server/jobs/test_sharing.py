@@ -13,6 +13,7 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.requests.jobs import SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
 from service.server.database import jobs, workers
+from service.server.jobs.queue import workflow_id
 from service.server.storage import layout
 from service.solve.base import batches
 from service.solve.solve import solve
@@ -128,7 +129,7 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture
     job = begin(both, capture, "svbrdf")
     both_at_work(both, job)
     assert both.database.transact(lambda connection: jobs.cancel(connection, job))
-    both.queue.cancel(job, 1)
+    both.queue.cancel(workflow_id(job, 1))
     both.until(lambda: {"step stopped", "help stopped"} <= set(events_of(both, job, "step stopped", "help stopped")), "stopped")
     no_pieces(both, job)
     assert both.row(job)["state"] == jobs.CANCELLED

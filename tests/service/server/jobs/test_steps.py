@@ -12,10 +12,9 @@ from service.requests.jobs import CheckJob, SolveJob
 from service.requests.light.frame_range import numbered
 from service.requests.solve import SolveOptions
 from service.server.database import intakes
-from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.context import Job
 from service.server.jobs.steps import _parts, steps_of
 from service.server.storage import layout
-from service.server.storage.objects import open_storage
 from stage.errors import StageError
 from stage.formats import exr, images
 from tests.scenes.captures import make_scene, write_capture
@@ -41,10 +40,8 @@ def step_of(harness, capture, roots):
     return only_step(harness, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")), roots)
 
 
-def only_step(harness, request, roots, settings=None):
-    context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 64,
-                            lambda project: roots, settings=settings)
-    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, request, 1), context)
+def only_step(harness, request, roots, **settings):
+    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, request, 1), harness.context(roots=roots, max_pixels=64, **settings))
     return step
 
 
@@ -94,7 +91,7 @@ def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness
         idle_harness.database.transact(lambda connection: intakes.insert(
             connection, identifier=identifier, project=PROJECT, kind="capture", name="x", folder=str(capture)))
         only_step(idle_harness, CheckJob(kind="check", intake=identifier), (capture.parent,),
-                  idle_harness.settings.model_copy(update={"max_project_pixels": most})).run(silent)
+                  max_project_pixels=most).run(silent)
         return intakes.find(idle_harness.database, identifier, PROJECT)["state"]
 
     assert checked(320) == "ready"

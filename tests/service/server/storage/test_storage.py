@@ -8,7 +8,6 @@ import pytest
 
 from service.requests.base import identifiers
 from service.server.base.settings import Settings
-from service.server.jobs.one_step import KEYS_FILE
 from service.server.storage import layout, objects
 from service.server.storage.bucket import PIECE_BYTES
 from service.server.storage.folder import FolderStorage
@@ -146,7 +145,7 @@ def test_every_name_is_in_the_docs(tmp_path):
     for kind in (identifiers.CAPTURE, identifiers.ENVIRONMENT):
         assert f"{os.path.dirname(layout.intake('PROJECT', identifiers.new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
     assert f"{os.path.dirname(layout.results('PROJECT', identifiers.new_id(identifiers.JOB)))}/ID/…" in TEXT
-    for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", KEYS_FILE,
+    for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", "keys.json",
                  f"{part_files_folder(settings).name}/", f"{settings.cache.name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
                  objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
         assert name in TEXT, name
