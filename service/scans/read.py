@@ -1,6 +1,5 @@
 """Read the scans of a scan set: depth results with what lies beside them, and PLY files."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,12 +30,6 @@ ORTHOGRAPHIC_RANGE_M = 1e3
 class _Sigma(NamedTuple):
     values: np.ndarray
     source: str
-
-
-def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
-    """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory."""
-    for number in range(len(scans.scans)):
-        yield read_scan(file, scans, number)
 
 
 def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool = True) -> Scan:

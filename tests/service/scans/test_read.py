@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.scans.points.scan import Scan
-from service.scans.read import read_scan, read_scans
+from service.scans.read import read_scan
 from stage.capture.camera import Camera
 from stage.errors import ManifestError, StageError
 from stage.formats.ply import PointCloud, write_ply
@@ -49,7 +49,8 @@ def write(folder: Path, name: str, kind: str = "perspective", *, sigma: bool = T
 
 def read(folder: Path, *scans: dict) -> list[Scan]:
     (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "ball", "scans": list(scans)}))
-    return list(read_scans(*read_scan_set(folder)))
+    file, listed = read_scan_set(folder)
+    return [read_scan(file, listed, number) for number in range(len(listed.scans))]
 
 
 @pytest.mark.parametrize("kind", list(CAMERAS))
