@@ -104,7 +104,7 @@ def prepare_scan(scan: Scan, folder: Path, voxel_m: float | None = None) -> Prep
                        stored("clear", clear), camera_from_world, focal_of(camera), camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p), orthographic=parallel)
     return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
-                        stored("feather", feather), scan.normals_source == "photometric",
+                        stored("feather", feather), scan.maps is not None,
                         _normal_sigma(maps), side)
 
 

@@ -138,7 +138,7 @@ def test_the_places_of_a_scan_hold_all_blocks_that_it_marks_whatever_its_noise(t
               Camera(projection="perspective", resolution=(72, 96), focal_px=(130.0, 130.0)))
     cloud = camera.points(-shot.depth)[shot.mask]
     scan = Scan(name="s", path=tmp_path, points=cloud.astype(np.float32), sigma=sigma[shot.mask].astype(np.float32),
-                sigma_source="measured", normals=None, normals_source="unknown", colours=None, confidence=None, origin=np.zeros(3),
+                sigma_source="measured", normals=None, colours=None, confidence=None, origin=np.zeros(3),
                 camera=camera, pixels=np.flatnonzero(shot.mask), pose=pose, pose_covariance=None, maps=None)
     prepared = prepare_scan(scan, tmp_path)
     origin, voxel = np.array([0.011, -0.02, 0.007]), VOXEL
