@@ -140,9 +140,9 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
 def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
     listed, reference = alone.scans, _checked(request, file, alone)
     said = alone.warnings() + rotation_warnings(listed)
-    table, threads = listed.turntable, _threads(request)
+    table = listed.turntable
     timings.stage("read", len(listed.scans))
-    kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
+    kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=request.threads or os.cpu_count() or 1)
     known = kept.facts(request, timings.advance)
     missed, extents = _missed(request, known), [scan.extent_m for scan in known]
     timings.stage("register", 100)
@@ -155,7 +155,7 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
         return _Placed(known, poses, {}, {}, fixed.pairs, fixed_facts(fixed, known) | target_facts(places, known),
                        said + missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
-                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts, threads=threads)
+                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts)
     said += missed + _without_viewpoint(listed, known)
     starts = _starts(request, listed, [scan.pose for scan in known])
     try:
@@ -184,10 +184,6 @@ def _missed(request: RegisterRequest, scans: Sequence[ScanFacts]) -> list[str]:
         named += [] if request.board is None else [f"--board {request.board[0]}x{request.board[1]}"]
         raise RequestError(f"{' and '.join(named)}: no scan shows any: {scans[0].name}: {scans[0].missed}")
     return [f"{scan.name}: {scan.missed}" for scan in scans if scan.missed is not None]
-
-
-def _threads(request: RegisterRequest) -> int:
-    return request.threads or os.cpu_count() or 1
 
 
 def _checked(request: RegisterRequest, file: Path, alone: Distinct) -> int | None:
