@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.file_mutations import write_between
 from service.requests.register import FuseRequest
 from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
-from service.scans.points.rigid import exponential
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
 from tests.scenes import in_front
@@ -48,7 +48,7 @@ def maps_of(shot: Shot, seed: int, drift_degrees: float) -> SurfaceMaps:
     slope = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in np.eye(3)], axis=-1)
     own = slope / np.linalg.norm(slope, axis=-1, keepdims=True) @ shot.world_from_camera[:3, :3]
     axis = rng.standard_normal(3)
-    own = own @ exponential(np.radians(drift_degrees) * axis / np.linalg.norm(axis)).T
+    own = own @ Rotation.from_rotvec(np.radians(drift_degrees) * axis / np.linalg.norm(axis)).as_matrix().T
     own += np.radians(NORMAL_DEGREES) * rng.standard_normal(own.shape)
     normal = np.zeros((*shot.side, 3), dtype=np.float32)
     normal[shot.mask] = own / np.linalg.norm(own, axis=1, keepdims=True)

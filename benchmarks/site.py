@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.site_scene import STATUES, Scene, distance, look, make_scene
 from service.scans.points.ply_points import read_ply_points
-from service.scans.points.rigid import exponential, inverse, rigid_between
+from service.scans.points.rigid import inverse, rigid_between
 from stage.capture.camera import Camera
 from stage.files import write_text
 from stage.formats.ply import PointCloud, write_ply
@@ -96,7 +97,7 @@ def write_scan(scene: Scene, folder: Path, name: str, number: int, count: int, s
     middle = own.mean(axis=0, dtype=np.float64)
     size = float(np.sqrt(((own - middle.astype(np.float32)) ** 2).sum(axis=1).mean(dtype=np.float64)))
     start = pose.copy()
-    start[:3, :3] = exponential(rng.normal(scale=TURN_OFF, size=3)) @ pose[:3, :3]
+    start[:3, :3] = Rotation.from_rotvec(rng.normal(scale=TURN_OFF, size=3)).as_matrix() @ pose[:3, :3]
     start[:3, 3] = pose[:3, 3] + rng.normal(scale=FAR_OFF if far else NEAR_OFF, size=3)
     more = {}
     if number % CLOUD_EVERY == CLOUD_EVERY - 1:

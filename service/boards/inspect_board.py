@@ -208,13 +208,13 @@ def _asked(nominal: np.ndarray, smallest_px: int) -> np.ndarray:
 def _verdict(defects: list[Defect], regions: list[RegionResult], inspected: np.ndarray, wanted: np.ndarray,
              request: InspectBoardRequest) -> Verdict:
     """Return the verdict about the whole board: the worst of all, and no pass with too little inspected."""
-    verdicts = {result.verdict for result in regions}
-    if defects or Verdict.FAIL in verdicts:
-        return Verdict.FAIL
+    verdicts = [result.verdict for result in regions]
+    if defects:
+        verdicts.append(Verdict.FAIL)
     least = (LEAST_OF_REGIONS if regions else 1.0) if request.least_inspected is None else request.least_inspected
-    if Verdict.NOT_INSPECTED in verdicts or inspected.sum() < least * wanted.sum():
-        return Verdict.NOT_INSPECTED
-    return Verdict.UNDECIDED if Verdict.UNDECIDED in verdicts else Verdict.PASS
+    if inspected.sum() < least * wanted.sum():
+        verdicts.append(Verdict.NOT_INSPECTED)
+    return Verdict.worst(verdicts)
 
 
 def _share(judged: _Judged) -> float:

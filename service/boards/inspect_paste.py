@@ -95,7 +95,7 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
     paste = measure_paste(heights, pads, stencil_m=request.stencil_m, area_level=request.area_level, bridge_level=request.bridge_level)
     found = _datum(paste, pads, marks, request, search_m)
     results = _judge(paste, pads, names, found.datum, limits, _tile_variance(board, stitched, pads), request)
-    verdict = _worst(results) if limits else None
+    verdict = Verdict.worst(result.verdict for result in results if result.verdict is not None) if limits else None
     if not found.asked:
         warnings.append("offsets count from where most of the paste lies: an offset of the whole print is not seen without --marks")
     warnings += _shared(results, heights.grid.pixel_m)
@@ -243,21 +243,8 @@ def _verdict(paste: PadPaste | None, values: dict[str, Measured], ranges: dict[s
         return Verdict.FAIL
     if paste is None or paste.seen < least:
         return Verdict.NOT_INSPECTED
-    inside = True
-    for name, (low, high) in ranges.items():
-        if name not in values:  # an offset without paste, whose volume and area say what is wrong
-            inside = False
-            continue
-        value, sigma = values[name]
-        if value < low - k * sigma or value > high + k * sigma:
-            return Verdict.FAIL
-        inside &= low + k * sigma <= value <= high - k * sigma
-    return Verdict.PASS if inside else Verdict.UNDECIDED
-
-
-def _worst(results: list[PadResult]) -> Verdict:
-    verdicts = {result.verdict for result in results}
-    return next((each for each in (Verdict.FAIL, Verdict.NOT_INSPECTED, Verdict.UNDECIDED) if each in verdicts), Verdict.PASS)
+    # an offset without paste is not known; its volume and area say what is wrong
+    return Verdict.worst(Verdict.of(*values[name], limits, k) if name in values else Verdict.UNDECIDED for name, limits in ranges.items())
 
 
 def _row(result: PadResult) -> dict[str, Any]:

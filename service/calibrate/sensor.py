@@ -186,10 +186,7 @@ def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) 
     float32, linear."""
     dark = np.zeros_like(white.pixels)
     if capture.manifest.dark is not None:
-        path = capture.file(capture.manifest.dark)
-        recorded = images.read_pixels(path).astype(np.float32, copy=False)
-        check_radiance(path, recorded)
-        dark = linearise(recorded, capture.manifest.color_space).astype(np.float64)
+        dark = linearise(capture.recorded(capture.manifest.dark), capture.manifest.color_space).astype(np.float64)
     light = white.pixels - (dark if white_dark is None else white_dark.pixels)
     unlit = int((light[capture.mask()] <= 0).any(axis=-1).sum())
     if unlit:

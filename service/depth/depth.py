@@ -109,31 +109,27 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     sources = metadata(request, capture=capture.name, inputs=content, method=solution.method,
                        contents={} if calibration is None else {"tof_calibration": digest(calibration)})
     depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
-    maps: DepthMaps | CoordinateMaps
     if isinstance(solution, DecodedSolution):
         if not solution.estimated.any():
             declared = [sentence for sentence in solution.warnings if sentence.startswith("frames: as declared")]
             raise ManifestError(f"{capture.folder}: no pixel is decoded ({_reasons(solution)}): "
                                 f"{'; '.join(declared) or _advice(solution.counts(mask), using)}")
         refuse_unsure(solution.status, None, solution.confidence_map(), max_sigma=None, least_confidence=least)
-        timings.stage("write", 1)
-        maps = solution.maps(capture.camera, sources)
-        maps.write(depth_path)
-        with storage("remove", points_path):
-            points_path.unlink(missing_ok=True)  # of an earlier run: there are no points beside this file
         cloud = None
-        measured = solution.statistics()
     else:
         refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
         _check_plausible(solution, capture, using)
         _tell_shared_error(solution, capture, using)
         timings.stage("points", 1)
         cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
-        timings.stage("write", 1)
-        maps = solution.maps(capture.camera, sources)
-        maps.write(depth_path)
+    timings.stage("write", 1)
+    maps = solution.maps(capture.camera, sources)
+    maps.write(depth_path)
+    if cloud is None:
+        with storage("remove", points_path):
+            points_path.unlink(missing_ok=True)  # of an earlier run: there are no points beside this file
+    else:
         write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
-        measured = solution.statistics()
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     points = 0 if cloud is None else len(cloud.points)
     counts = solution.counts(mask)
@@ -148,7 +144,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         points=points,
-        **measured,
+        **solution.statistics(),
     ))
     return DepthResult(maps, depth_path, None if cloud is None else points_path, report_path, solution.method, points, counts,
                        tuple(solution.warnings))

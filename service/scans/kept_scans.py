@@ -144,7 +144,7 @@ class KeptScans:
 
     def scan(self, number: int) -> Scan:
         """Read a scan; its normals are those of its file, or not there."""
-        return read_scan(self._file, self._listed, number, estimate_normals=False)
+        return read_scan(self._file, self._listed, number)
 
 
 def _packed_facts(facts: ScanFacts) -> bytes:

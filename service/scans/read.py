@@ -1,12 +1,11 @@
 """Read the scans of a scan set: depth results with what lies beside them, and PLY files."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from service.scans.points.planes import LocalPlanes, local_planes, robust_scatter
+from service.scans.points.planes import local_planes, robust_scatter
 from service.scans.points.ply_points import PlyPoints, read_ply_points
 from service.scans.points.rigid import nearest_rigid
 from service.scans.points.scan import Scan, Target
@@ -15,13 +14,10 @@ from stage.errors import ManifestError, ResultError
 from stage.formats import exr
 from stage.formats.ply import POINTS_FILE, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
-from stage.results.depth_normals import depth_normals
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from stage.results.result_metadata import camera_and_provenance, result_file
 from stage.sets.scan_set import MOST_M, UNITS_M, ScanEntry, ScanSet
 
-NORMAL_RADIUS_PX = 2
-"""Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""
 FLOAT_STEP = 2.0**-22
 """A float32 resolves a coordinate to this part of it: no σ is smaller."""
 ORTHOGRAPHIC_RANGE_M = 1e3
@@ -33,25 +29,18 @@ class _Sigma(NamedTuple):
     source: str
 
 
-def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
-    """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory."""
-    for number in range(len(scans.scans)):
-        yield read_scan(file, scans, number)
-
-
-def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool = True) -> Scan:
+def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
     """Read one scan of a set.
-    `number`: of the scan, from 0. `estimate_normals`: whether normals are fitted to the points where the scan has none; without them the
-    scan has none."""
+    `number`: of the scan, from 0."""
     entry = scans.scans[number]
     where = f"{file}: scans[{number}] ({entry.name})"
     path = file.parent / entry.path
     covariance = None if entry.pose_covariance is None else np.array(entry.pose_covariance, dtype=np.float64)
     if path.is_file() and path.suffix.lower() == ".ply":
-        return _point_set(path, entry, where, _pose(entry), covariance, estimate_normals)
+        return _point_set(path, entry, where, _pose(entry), covariance)
     if not (path / DEPTH_FILE).is_file() and not (path.is_file() and path.suffix.lower() == ".exr"):
         raise ManifestError(f"{where}: path: {path} is neither a folder with a {DEPTH_FILE} nor a PLY file")
-    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, covariance, estimate_normals)
+    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, covariance)
 
 
 def given_pose(file: Path, entry: ScanEntry) -> np.ndarray | None:
@@ -73,8 +62,7 @@ def targets_of(entry: ScanEntry) -> tuple[Target, ...]:
     return tuple(Target(target.name, np.array(target.position_m), target.sigma_m**2 * np.eye(3)) for target in entry.targets)
 
 
-def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, covariance: np.ndarray | None, estimate_normals: bool
-                 ) -> Scan:
+def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, covariance: np.ndarray | None) -> Scan:
     if entry.unit != "m":
         raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
     if entry.viewpoint_m is not None:
@@ -95,34 +83,23 @@ def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, covarianc
     origin = np.zeros(3) if camera.projection == "perspective" else points.mean(axis=0) + ORTHOGRAPHIC_RANGE_M * np.array(
         [0, 0, max(float(np.ptp(points, axis=0).max()), np.finfo(np.float32).tiny)])
     measured = None if depth.sigma is None else depth.sigma.reshape(-1)[pixels] * stretch
-    sigma = _sigma(measured, entry, points, None if measured is not None or entry.sigma_m is not None
-                   else local_planes(points, origin=origin), where)
+    sigma = _sigma(measured, entry, points, where)
     maps = None if entry.maps is None else result_file(home / entry.maps, MAPS_FILE, command="relit solve")
     if maps is not None:
-        normals, source = _photometric(maps, where, used).reshape(-1, 3)[pixels], "photometric"
-    elif not estimate_normals:
-        normals, source = None, "unknown"
-    else:
-        per_depth = np.zeros(used.size, dtype=np.float32)
-        per_depth[pixels] = sigma.values / stretch
-        image = depth_normals(depth.depth, used, camera, sigma=per_depth.reshape(used.shape), radius=NORMAL_RADIUS_PX)
-        normals = image.reshape(-1, 3)[pixels]
-        source = "estimated"
-    return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source,
-                normals=normals, normals_source=source, colours=_colours(path, depth.mask, used),
+        _check_maps(maps, where, used)
+    return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source, normals=None,
+                colours=_colours(path, depth.mask, used),
                 confidence=None if depth.confidence is None else depth.confidence.reshape(-1)[pixels].astype(np.float32), origin=origin,
                 camera=camera, pixels=pixels, pose=_pose(entry, camera), pose_covariance=covariance, maps=maps, targets=targets_of(entry))
 
 
-def _photometric(path: Path, where: str, used: np.ndarray) -> np.ndarray:
-    """Return the normals of solved maps, [rows, cols, 3], 0 where they have none."""
+def _check_maps(path: Path, where: str, used: np.ndarray) -> None:
     maps = SurfaceMaps.read(path, layers=("normal",))
     if maps.normal is None:
         raise ResultError(f"{path}: has no layer normal")
     if maps.mask.shape != used.shape:
         raise ManifestError(f"{where}: maps: {path} is {maps.mask.shape[1]}x{maps.mask.shape[0]} pixels, the depth "
                             f"{used.shape[1]}x{used.shape[0]}: both must be of one camera in one place")
-    return maps.normal
 
 
 def _colours(path: Path, mask: np.ndarray, used: np.ndarray) -> np.ndarray | None:
@@ -134,8 +111,7 @@ def _colours(path: Path, mask: np.ndarray, used: np.ndarray) -> np.ndarray | Non
     return colours[used[mask]] if len(colours) == mask.sum() else None  # a laser has points between pixels
 
 
-def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None, covariance: np.ndarray | None,
-               estimate_normals: bool) -> Scan:
+def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
     if entry.maps is not None:
         raise ManifestError(f"{where}: maps: {path.name} is a set of points: solved maps belong to a range image")
     unit = UNITS_M[entry.unit]
@@ -147,21 +123,13 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
     if (farthest := float(np.abs(ply.points).max()) * unit) > MOST_M:
         raise ManifestError(f"{where}: path: {path.name} has a coordinate of {farthest:.3g} m, {MOST_M:.0e} m are the most: check its unit")
     points = (ply.points * unit).astype(np.float32)
-    planes = None
-    if (ply.normals is None and estimate_normals) or (ply.sigma is None and entry.sigma_m is None):
-        planes = local_planes(points, origin=origin)
-    sigma = _sigma(None if ply.sigma is None else ply.sigma * unit, entry, points, planes, where)
-    normals: np.ndarray | None
-    if ply.normals is None and not estimate_normals:
-        normals, source = None, "unknown"
-    elif ply.normals is None and planes is not None:
-        normals, source = planes.normals, "estimated"
-    else:
-        assert ply.normals is not None
+    sigma = _sigma(None if ply.sigma is None else ply.sigma * unit, entry, points, where)
+    normals = None
+    if ply.normals is not None:
         length = np.linalg.norm(ply.normals, axis=1, keepdims=True)
-        normals, source = np.where(length > 0, ply.normals / np.maximum(length, 1e-30), 0).astype(np.float32), "given"
+        normals = np.where(length > 0, ply.normals / np.maximum(length, 1e-30), 0).astype(np.float32)
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source, normals=normals,
-                normals_source=source, colours=ply.colours, confidence=ply.confidence, origin=origin, camera=None, pixels=None, pose=pose,
+                colours=ply.colours, confidence=ply.confidence, origin=origin, camera=None, pixels=None, pose=pose,
                 pose_covariance=covariance, maps=None, targets=targets_of(entry))
 
 
@@ -176,15 +144,14 @@ def _kept(ply: PlyPoints, viewpoint: np.ndarray | None) -> PlyPoints:
                         kept=kept)
 
 
-def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, planes: LocalPlanes | None, where: str) -> _Sigma:
+def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, where: str) -> _Sigma:
     """Return σ along the line of sight of each point."""
     least = FLOAT_STEP * float(np.abs(points).max())
     if measured is not None:
         return _Sigma(np.maximum(measured, least).astype(np.float32), "measured")
     if entry.sigma_m is not None:
         return _Sigma(np.full(len(points), max(entry.sigma_m, least), dtype=np.float32), "declared")
-    assert planes is not None
-    scatter = robust_scatter(planes)
+    scatter = robust_scatter(local_planes(points, origin=points.mean(axis=0)))
     if not np.isfinite(scatter):
         raise ManifestError(f"{where}: sigma_m: is missing, and {len(points)} points are too few or too far apart to estimate it")
     return _Sigma(np.full(len(points), max(scatter, least), dtype=np.float32), "estimated")

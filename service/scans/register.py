@@ -14,11 +14,11 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report, versions
 from service.requests.register import Accepted, GivenPoses, RegisterRequest, TableUse
 from service.scans.duplicates import Distinct, distinct
-from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
+from service.scans.kept_scans import KeptScans, ScanFacts
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.scans.points.neighbours import neighbours_are_installed
 from service.scans.points.rigid import about, applied
-from service.scans.read import given_pose, read_scans
+from service.scans.read import given_pose
 from service.scans.registration.fixed_poses import check_fixed
 from service.scans.registration.pairs import Evidence, Pair, PairState
 from service.scans.registration.registration import NoneJoinedError, RegistrationOptions, register_by
@@ -140,33 +140,26 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
 def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
     listed, reference = alone.scans, _checked(request, file, alone)
     said = alone.warnings() + rotation_warnings(listed)
-    table, threads = listed.turntable, _threads(request)
+    table = listed.turntable
     timings.stage("read", len(listed.scans))
+    kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=request.threads or os.cpu_count() or 1)
+    known = kept.facts(request, timings.advance)
+    missed, extents = _missed(request, known), [scan.extent_m for scan in known]
+    timings.stage("register", 100)
     if request.turntable is TableUse.FIXED:
         assert table is not None and table.angles_deg is not None
-        scans = []
-        for scan in read_scans(file, listed):
-            scans.append(scan)
-            timings.advance(len(scans))
-        timings.stage("register", 100)
-        fixed = check_fixed(scans, [table.pose_at(angle) for angle in table.angles_deg], threads=threads,
-                            advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
-        known = [facts_of(scan, file, listed, number, request) for number, scan in enumerate(scans)]
-        missed = _missed(request, known)
+        fixed = check_fixed(kept, extents, [table.pose_at(angle) for angle in table.angles_deg], cell_m=request.cell_m,
+                            least_overlap=request.least_overlap, advance=timings.advance_percent)
         poses = dict(enumerate(fixed.poses))
         places = target_places({number: scan.targets for number, scan in enumerate(known)}, poses, {})
         return _Placed(known, poses, {}, {}, fixed.pairs, fixed_facts(fixed, known) | target_facts(places, known),
                        said + missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
-    kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
-    known = kept.facts(request, timings.advance)
-    missed = _missed(request, known)
-    timings.stage("register", 100)
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
-                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts, threads=threads)
+                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts)
     said += missed + _without_viewpoint(listed, known)
     starts = _starts(request, listed, [scan.pose for scan in known])
     try:
-        found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], starts, options,
+        found = register_by(kept, [scan.name for scan in known], extents, starts, options,
                             table=table if request.turntable is TableUse.ANGLES else None,
                             targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
     except NoneJoinedError as error:
@@ -191,10 +184,6 @@ def _missed(request: RegisterRequest, scans: Sequence[ScanFacts]) -> list[str]:
         named += [] if request.board is None else [f"--board {request.board[0]}x{request.board[1]}"]
         raise RequestError(f"{' and '.join(named)}: no scan shows any: {scans[0].name}: {scans[0].missed}")
     return [f"{scan.name}: {scan.missed}" for scan in scans if scan.missed is not None]
-
-
-def _threads(request: RegisterRequest) -> int:
-    return request.threads or os.cpu_count() or 1
 
 
 def _checked(request: RegisterRequest, file: Path, alone: Distinct) -> int | None:

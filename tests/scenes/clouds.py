@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from service.scans.points.rigid import exponential, inverse
+from service.scans.points.rigid import inverse
 from stage.formats.ply import PointCloud, write_ply
 from tests.scenes.statue import SIGMA, colour_of, distance, place, trace
 
@@ -32,7 +33,7 @@ def scatter(pose: np.ndarray, rays: int, *, sigma: float = SIGMA, seed: int = 0,
     along, hit = trace(pose[:3, 3], direction, scene)
     world = pose[:3, 3] + (along + sigma * rng.standard_normal(rays))[hit, None] * direction[hit]
     world_from_file = np.eye(4)
-    world_from_file[:3, :3], world_from_file[:3, 3] = exponential(rng.normal(0, 1, 3)), rng.normal(0, 0.5, 3)
+    world_from_file[:3, :3], world_from_file[:3, 3] = Rotation.from_rotvec(rng.normal(0, 1, 3)).as_matrix(), rng.normal(0, 0.5, 3)
     file = inverse(world_from_file)
     return Cloud(world @ file[:3, :3].T + file[:3, 3], colour_of(world), world_from_file, file[:3, :3] @ pose[:3, 3] + file[:3, 3])
 

@@ -7,8 +7,8 @@ the right answer nowhere.
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from service.scans.points.rigid import exponential
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
 from tests.scenes.statue import Shot, place, shoot
@@ -41,7 +41,7 @@ def plates(p: np.ndarray) -> np.ndarray:
 
 def disc(p: np.ndarray) -> np.ndarray:
     """A disc of 4 mm, 14° tilted, 40 mm before a wall."""
-    tilt = exponential(np.radians([9.0, 11.0, 0.0]))
+    tilt = Rotation.from_rotvec(np.radians([9.0, 11.0, 0.0])).as_matrix()
     q = (p - [0, 0, 0.04]) @ tilt
     over = np.stack([np.hypot(q[..., 0], q[..., 1]) - 0.07, np.abs(q[..., 2]) - 2e-3], axis=-1)
     flat = np.linalg.norm(np.maximum(over, 0), axis=-1) + np.minimum(over.max(axis=-1), 0)
@@ -50,7 +50,7 @@ def disc(p: np.ndarray) -> np.ndarray:
 
 def step(p: np.ndarray) -> np.ndarray:
     """A step of 15 mm across a wall, at no angle to the lattice that would be special."""
-    turn = exponential(np.radians([0.0, 0.0, 17.0]))
+    turn = Rotation.from_rotvec(np.radians([0.0, 0.0, 17.0])).as_matrix()
     block = np.maximum(_box(p @ turn, (0.3, 0, 0), (0.3, 0.3, 0.015)), _box(p, (0, 0, 0), (0.16, 0.16, 0.02)))
     return _waved(np.minimum(_wall(p), block), p)
 
@@ -74,7 +74,7 @@ def chair(p: np.ndarray) -> np.ndarray:
     """A chair of bars of 8 to 12 mm with a seat, turned, before a wall that is bent with a radius of 290 mm."""
     bent = np.maximum(0.29 - np.hypot(p[..., 0], p[..., 2] - 0.27), np.maximum(np.abs(p[..., 0]) - 0.16, np.abs(p[..., 1]) - 0.15))
     bent = np.maximum(bent, np.maximum(p[..., 2] - 0.12, -0.06 - p[..., 2]))
-    q = (p - [0, 0, 0.07]) @ exponential(np.radians([14.0, -23.0, 6.0]))
+    q = (p - [0, 0, 0.07]) @ Rotation.from_rotvec(np.radians([14.0, -23.0, 6.0])).as_matrix()
     return _waved(np.min([bent, *(_box(q, centre, half) for centre, half in CHAIR)], axis=0), p)
 
 
@@ -106,7 +106,7 @@ def photometric(scene: Field, shot: Shot, *, seed: int, noise_degrees: float, dr
     camera = Camera(projection="perspective", resolution=shot.side[::-1], focal_px=(shot.focal, shot.focal))
     points = camera.points(-shot.true)[shot.mask] @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
     own = unit(gradient(scene, points)) @ shot.world_from_camera[:3, :3]
-    turned = own @ exponential(np.radians(drift_degrees) * unit(rng.standard_normal(3))).T
+    turned = own @ Rotation.from_rotvec(np.radians(drift_degrees) * unit(rng.standard_normal(3))).as_matrix().T
     normal = np.zeros((*shot.side, 3), dtype=np.float32)
     normal[shot.mask] = unit(turned + np.radians(noise_degrees) * rng.standard_normal(own.shape))
     return SurfaceMaps(camera=camera, mask=shot.mask, normal=normal, sigma=np.full(shot.side, noise_degrees, dtype=np.float32))

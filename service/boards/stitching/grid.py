@@ -7,7 +7,7 @@ the camera. Heights are z. A grid is an orthographic camera that looks along -z,
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.ndimage import correlate1d, uniform_filter
+from scipy.ndimage import correlate1d, maximum_filter, uniform_filter
 
 from stage.capture.camera import Camera
 from stage.spread import MAD_TO_SIGMA
@@ -162,9 +162,10 @@ def shift_error(
         clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * left
         error = np.maximum(error, np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0))
         if max(sigma_px) > WIDE_PX:
-            reach = [int(np.ceil(2.5 * sigma)) for sigma in sigma_px]
-            high, low = (_extreme(means, reach, sign) for sign in (1, -1))
-            error = np.maximum(error, np.clip(np.nan_to_num(high + low) - NOISE_SPAN * left, 0, None) / 2)
+            size = tuple(2 * int(np.ceil(2.5 * sigma)) + 1 for sigma in reversed(sigma_px))
+            high, low = (maximum_filter(np.where(np.isfinite(means), sign * means, -np.inf), size, mode="constant", cval=-np.inf)
+                         for sign in (1, -1))
+            error = np.maximum(error, np.clip(high + low - NOISE_SPAN * left, 0, None) / 2)
     return error
 
 
@@ -173,22 +174,6 @@ def local_means(height: np.ndarray, side: int) -> np.ndarray:
     known = np.isfinite(height)
     total, count = (uniform_filter(values, side, mode="constant") for values in (np.where(known, height, 0), known.astype(np.float64)))
     return np.where(known, total / np.where(known, count, 1), np.nan)
-
-
-def _extreme(height: np.ndarray, reach: list[int], sign: int) -> np.ndarray:
-    """Return the largest value of sign · height within `reach` columns and rows of each pixel."""
-    out = sign * height
-    for axis, steps in ((1, reach[0]), (0, reach[1])):
-        done = 0
-        while done < steps:  # windows grow by at most their own size
-            step = min(done + 1, steps - done)
-            pad = [(0, 0), (0, 0)]
-            pad[axis] = (step, step)
-            padded = np.pad(out, pad, constant_values=np.nan)
-            length = out.shape[axis]
-            out = np.fmax(out, np.fmax(padded.take(range(length), axis), padded.take(range(2 * step, length + 2 * step), axis)))
-            done += step
-    return np.asarray(out)
 
 
 SMOOTHED = (3, 9)

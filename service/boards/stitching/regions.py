@@ -1,6 +1,6 @@
 """Test whether the regions of a design are within their tolerances, decided by σ (ISO 14253-1)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -22,6 +22,19 @@ class Verdict(StrEnum):
     """So near to a limit that the uncertainty does not tell."""
     NOT_INSPECTED = "not inspected"
     """Too few of its pixels are measured."""
+
+    @classmethod
+    def of(cls, value: float, sigma: float, limits: tuple[float, float], k: float) -> "Verdict":
+        """Decide about a measured value; `k`: the standard deviations by which it must be within its limits, or outside."""
+        low, high = limits
+        if value < low - k * sigma or value > high + k * sigma:
+            return cls.FAIL
+        return cls.PASS if low + k * sigma <= value <= high - k * sigma else cls.UNDECIDED
+
+    @classmethod
+    def worst(cls, verdicts: Iterable["Verdict"]) -> "Verdict":
+        """Return the verdict about a whole whose parts have these; a part that fails counts before one that was not inspected."""
+        return min(verdicts, key=[cls.FAIL, cls.NOT_INSPECTED, cls.UNDECIDED, cls.PASS].index, default=cls.PASS)
 
 
 class RegionResult(NamedTuple):
@@ -93,14 +106,7 @@ def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float, l
         if datum is None or datum.pixels < least * max(int((ring & ~taken[around]).sum()), 1):
             return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, mean.pixels)
         value, sigma = value - datum.value, float(np.hypot(sigma, datum.sigma))
-    low, high = region.tolerance_m
-    if value < low - k * sigma or value > high + k * sigma:
-        verdict = Verdict.FAIL
-    elif low + k * sigma <= value <= high - k * sigma:
-        verdict = Verdict.PASS
-    else:
-        verdict = Verdict.UNDECIDED
-    return RegionResult(region, verdict, value, sigma, count, mean.pixels)
+    return RegionResult(region, Verdict.of(value, sigma, region.tolerance_m, k), value, sigma, count, mean.pixels)
 
 
 def expected_pixels(region: Region, grid: BoardGrid) -> float:

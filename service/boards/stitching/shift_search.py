@@ -4,6 +4,7 @@ Source: Padfield, "Masked object registration in the Fourier domain", IEEE Trans
 """
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from service.boards.stitching.grid import HeightPatch, robust_sigma
 
@@ -34,9 +35,7 @@ def find_shifts(first: HeightPatch, second: HeightPatch, rows: slice, cols: slic
     if not np.isfinite(score).any():
         return [(0, 0)]
     steps = np.arange(-search_px, search_px + 1)
-    padded = np.pad(np.where(np.isfinite(score), score, np.inf), 1, constant_values=np.inf)
-    around = np.min([padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)],
-                    axis=0)
+    around = minimum_filter(np.where(np.isfinite(score), score, np.inf), 3, mode="constant", cval=np.inf)
     lowest = np.isfinite(score) & (score <= around)
     prior = (steps[:, None] ** 2 + steps[None] ** 2) / (2 * sigma_px**2)
     cost = pixels / SHARED_PX / 2 * np.log(np.maximum(score, 1e-30)) + prior

@@ -105,11 +105,16 @@ def holds_a_pose(seen: np.ndarray, board: tuple[int, int]) -> bool:
     return len(seen) >= LEAST_SEEN and all((np.bincount(lines) >= 2).sum() >= 2 for lines in (seen // board[0], seen % board[0]))
 
 
-def _markers(shown: np.ndarray, dictionary: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners [markers, 4, 2] of the markers in an image, in OpenCV's pixels, and their numbers [markers]."""
+def marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    """Return the finder of the markers of one of DICTIONARIES, whose corners it refines."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
+
+
+def _markers(shown: np.ndarray, dictionary: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners [markers, 4, 2] of the markers in an image, in OpenCV's pixels, and their numbers [markers]."""
+    detector = marker_detector(dictionary)
     best = np.zeros((0, 4, 2)), np.zeros(0, int)
     for times in (1, 2):
         enlarged = shown if times == 1 else cv2.resize(shown, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)

@@ -8,7 +8,7 @@ would pull it by hundredths of a pixel. One spot a frame is little work, so this
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import label, map_coordinates, uniform_filter
 
 from kernels.status import Status
 from service.depth.laser.background import background
@@ -121,13 +121,8 @@ def _uneven(window: np.ndarray, centre: np.ndarray, width: float) -> float:
     shape = np.exp(-0.5 * square / own)
     left = window - mass / float((gauss * shape).sum()) * shape
     mirror = 2 * centre[:, None, None] - np.stack([rows, cols])
-    near = np.floor(mirror).astype(int)
-    part = mirror - near
-    inside = ((near >= 0) & (near + 1 < np.array(window.shape)[:, None, None])).all(axis=0)
-    r, c = np.where(inside, near, 0)
-    there = ((1 - part[0]) * ((1 - part[1]) * left[r, c] + part[1] * left[r, c + 1])
-             + part[0] * ((1 - part[1]) * left[r + 1, c] + part[1] * left[r + 1, c + 1]))
-    odd = np.where(inside, 0.5 * (left - there), 0)
+    inside = ((mirror >= 0) & (mirror < np.array(window.shape)[:, None, None] - 1)).all(axis=0)
+    odd = np.where(inside, 0.5 * (left - map_coordinates(left, mirror, order=1)), 0)
     side = max(2, round(width))
     blocks = (rows // side) * (window.shape[1] // side + 1) + cols // side
     pulls = [np.bincount(blocks.ravel(), weights=(axis * gauss * odd).ravel()) for axis in off]
@@ -157,9 +152,7 @@ def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: n
 
 def _blurred(values: np.ndarray) -> np.ndarray:
     """Return the mean of 3×3 pixels, with zeros outside: it lowers a hot pixel below a spot."""
-    padded = np.pad(values, 1)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return np.asarray((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9)
+    return np.asarray(uniform_filter(values, 3, mode="constant"))
 
 
 def _hanging_together(above: np.ndarray, row: int, col: int) -> np.ndarray:

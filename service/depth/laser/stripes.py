@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from kernels.device import to_numpy
 from kernels.status import Status
@@ -108,19 +109,8 @@ def _relative_albedo(energy: np.ndarray, fourth: np.ndarray, noise2: float) -> n
 
 def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Return the mean of the values over a window, of those pixels that are marked; 0 where none is."""
-    weight = _sum_around(where.astype(np.float32))
-    return np.where(weight > 0, _sum_around(np.where(where, values, 0).astype(np.float32)) / np.maximum(weight, 1), 0)
-
-
-def _sum_around(values: np.ndarray) -> np.ndarray:
-    """Return the sum over the window about each pixel; beyond the image values count as 0."""
-    for axis in (0, 1):
-        room = [(0, 0), (0, 0)]
-        room[axis] = (WINDOW_PX // 2, WINDOW_PX // 2)
-        padded = np.pad(values, room)
-        length = values.shape[axis]
-        values = np.add.reduce([np.take(padded, range(start, start + length), axis=axis) for start in range(WINDOW_PX)])
-    return values
+    total, weight = (uniform_filter(each, WINDOW_PX, output=np.float64, mode="constant") for each in (np.where(where, values, 0), where))
+    return np.asarray(total / np.maximum(weight, 1e-6))
 
 
 NOISE_SAMPLE = 200_000

@@ -1,6 +1,7 @@
 """Doubts that only the whole image raises: pixels that contradict their neighbours, other points or the epipolar geometry."""
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from kernels.device import to_numpy
 from kernels.status import SOLVED, Status
@@ -92,19 +93,9 @@ def _doubt_around(right: np.ndarray, status: np.ndarray) -> np.ndarray:
     known = solved.astype(np.float32)
     for code, weight in DISTRUSTED.items():
         known[status == code] = weight
-    share = _mean_around(trust * known, known)
+    trusted, counted = (uniform_filter(plane, 2 * AROUND + 1, output=np.float64, mode="constant") for plane in (trust * known, known))
+    share = np.where(counted > 1e-6, trusted / np.maximum(counted, 1e-6), 1.0)
     return np.where(solved & (share < TRUSTED_PART), np.minimum(right, DOUBTED + share * (LIKELY - DOUBTED)), right).astype(np.float32)
-
-
-def _mean_around(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the sum of values over the sum of weights in the square of 2 AROUND + 1 pixels about each pixel; 1 where no weight is."""
-    sums = []
-    for plane in (values, weight):
-        total = np.cumsum(np.cumsum(np.pad(plane, AROUND + 1).astype(np.float64), axis=0), axis=1)
-        size = 2 * AROUND + 1
-        window = total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
-        sums.append(window[:values.shape[0], :values.shape[1]])
-    return np.asarray(np.where(sums[1] > 1e-6, sums[0] / np.maximum(sums[1], 1e-6), 1.0))
 
 
 def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask: np.ndarray, request: DepthRequest,

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import correlate1d
 
 from stage.capture.camera import Camera, OtherCamera
 from stage.capture.capture import Capture
@@ -37,6 +38,8 @@ BORDER = 64
 """Points along each side of an image from which the extent of its rectified image is taken."""
 BAND_PIXELS = 1 << 20
 """Pixels that are resampled at one time."""
+BINOMIAL = (0.25, 0.5, 0.25)
+"""The filter by which both images are smoothed along rows and columns."""
 
 
 class Grid(NamedTuple):
@@ -210,7 +213,4 @@ def rectified_frames(capture: Capture, frames: Sequence[Frame], other: int, rect
 
 def smoothed(image: np.ndarray) -> np.ndarray:
     """Return an image [rows, cols] float32, smoothed by the binomial filter 1 2 1 along rows and columns; borders are continued."""
-    for axis in (0, 1):
-        along = np.moveaxis(np.pad(image, [(int(axis == 0),) * 2, (int(axis == 1),) * 2], mode="edge"), axis, 0)
-        image = np.moveaxis((along[:-2] + along[2:]) * np.float32(0.25) + along[1:-1] * np.float32(0.5), 0, axis)
-    return image
+    return np.asarray(correlate1d(correlate1d(image, BINOMIAL, axis=0, mode="nearest"), BINOMIAL, axis=1, mode="nearest"))

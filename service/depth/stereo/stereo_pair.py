@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from kernels.device import to_numpy
 from kernels.status import Status
@@ -232,12 +233,7 @@ LEAST_KNOWN = 0.3
 
 def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
     """Return the mean in a square of 2 reach + 1 pixels around each pixel, [rows, cols] float64; borders are continued."""
-    size = 2 * reach + 1
-    for axis in (0, 1):
-        padded = np.pad(values.astype(np.float64), [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        total = np.moveaxis(np.cumsum(padded, axis=axis), axis, 0)
-        values = np.moveaxis((total[size:] - total[:-size]) / size, 0, axis)
-    return values
+    return np.asarray(uniform_filter(values, 2 * reach + 1, output=np.float64, mode="nearest"))
 
 
 def contrast(images: np.ndarray, reach: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from kernels.device import to_numpy
 from kernels.packs import padded_count
@@ -39,8 +40,8 @@ STEP_TIMES = 4.0
 LEAST_NEIGHBOURS = 8
 FARTHEST_PX = 0.8
 """The most pixels from the middle of the nearest pixel of the second camera to the place that it sees."""
-PER_CELL = 12
-"""The most pixels of the second camera that are compared in each cell of the search."""
+FARTHEST_CELLS = 4.0
+"""The farthest that the nearest pixel of the second camera is looked for in the projector, in distances of such pixels there."""
 SMALLEST_SLOPE = 0.02
 """The least determinant of the slopes, relative to its median: below it the place slides along the image."""
 
@@ -203,9 +204,11 @@ def find_places(column: np.ndarray, row: np.ndarray, sigma_column: np.ndarray, s
         return nothing
     place, value, slope, variance = planes
     spacing = float(np.sqrt(np.median(np.abs(np.linalg.det(slope)))))
-    nearest, far = _nearest(np.stack([column, row], axis=1), value, 2 * max(spacing, 1e-6))
+    asked = np.stack([column, row], axis=1)
+    far, nearest = cKDTree(value).query(asked, distance_upper_bound=FARTHEST_CELLS * max(spacing, 1e-6))
+    nearest = np.minimum(nearest, len(value) - 1)  # of none that is near enough
     inverse = np.linalg.inv(slope[nearest])
-    wanted = np.stack([column, row], axis=1) - value[nearest]
+    wanted = asked - value[nearest]
     moved = np.einsum("nij,nj->ni", inverse, wanted)
     spread = variance[nearest] + np.stack([sigma_column, sigma_row], axis=1) ** 2
     sigma = np.sqrt(np.einsum("nij,nj->ni", inverse**2, spread))
@@ -265,30 +268,3 @@ def _planes(other: CodedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 def _pairs(solved: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Return whether a pixel and the next along an axis are solved."""
     return (solved[:-1], solved[1:]) if axis == 0 else (solved[:, :-1], solved[:, 1:])
-
-
-def _nearest(wanted: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the nearest value to each wanted one, [n], and its squared distance, [n]; infinite where none is near."""
-    low = np.minimum(values.min(axis=0), wanted.min(axis=0)) - cell
-    stride = int(np.ceil((max(values[:, 1].max(), wanted[:, 1].max()) - low[1]) / cell)) + 3
-
-    def key(points: np.ndarray) -> np.ndarray:
-        numbers = np.floor((points - low) / cell).astype(np.int64)
-        return numbers[:, 0] * stride + numbers[:, 1]
-
-    own = key(values)
-    order = np.argsort(own, kind="stable")
-    sorted_keys, asked = own[order], key(wanted)
-    best, nearest = np.full(len(wanted), np.inf), np.zeros(len(wanted), dtype=np.int64)
-    for shift in (du * stride + dv for du in (-1, 0, 1) for dv in (-1, 0, 1)):
-        first = np.searchsorted(sorted_keys, asked + shift)
-        for offset in range(PER_CELL):
-            at = np.minimum(first + offset, len(order) - 1)
-            inside = sorted_keys[at] == asked + shift
-            if not inside.any():
-                break
-            index = order[at]
-            distance = np.where(inside, ((values[index] - wanted) ** 2).sum(axis=1), np.inf)
-            closer = distance < best
-            best, nearest = np.where(closer, distance, best), np.where(closer, index, nearest)
-    return nearest, best

@@ -7,6 +7,7 @@ a variance of g times their mean, and divided by g they are as precise as photon
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from kernels.spread import MAD_TO_SIGMA
 
@@ -106,20 +107,12 @@ def _dispersion(counts: np.ndarray) -> float | None:
 
 def _is_background(total: np.ndarray) -> np.ndarray:
     """Return where the pairs on both sides of a pair have no return, [pair, bin]; the pair's own noise has no part in it."""
-    summed = _box(_box(total, NEAR_PAIRS, 0), NEAR_BINS, 1) - _box(total, NEAR_BINS, 1)
+    bins = convolve1d(total, np.ones(2 * NEAR_BINS + 1), axis=1, mode="constant")
+    summed = convolve1d(bins, np.ones(2 * NEAR_PAIRS + 1), axis=0, mode="constant") - bins
     level = np.median(summed, axis=1, keepdims=True)
     noise = NEAR_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(summed - level), axis=1, keepdims=True)
     height = NEAR_PART * (summed.max(axis=1, keepdims=True) - level)
     return np.asarray(summed <= level + np.where(noise > 0, np.minimum(noise, height), height))
-
-
-def _box(values: np.ndarray, reach: int, axis: int) -> np.ndarray:
-    """Return sums over `reach` entries to both sides along an axis."""
-    around = [(0, 0), (0, 0)]
-    around[axis] = (reach + 1, reach)
-    sums = np.cumsum(np.pad(values, around), axis=axis)
-    count = values.shape[axis]
-    return np.asarray(np.take(sums, np.arange(count) + 2 * reach + 1, axis=axis) - np.take(sums, np.arange(count), axis=axis))
 
 
 def _step(counts: np.ndarray) -> float:

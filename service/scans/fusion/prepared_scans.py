@@ -127,7 +127,7 @@ class PreparedScans:
     def _read(self, number: int) -> PreparedScan:
         folder = self._folder / str(number)
         folder.mkdir()
-        scan = read_scan(self._file, self._scan_set, number, estimate_normals=False)
+        scan = read_scan(self._file, self._scan_set, number)
         where = f"{self._file}: scans[{number}] ({scan.name})"
         if scan.pose is None:
             raise RequestError(f"{where}: scan_to_world is missing: run relit register first, and fuse the scan-set.json that it writes")
@@ -210,7 +210,7 @@ def as_range_image(scan: Scan, where: str, voxel_m: float | None = None, *, devi
     scan_from_camera[:3, :3], scan_from_camera[:3, 3] = camera_from_scan.T, scan.origin
     assert scan.pose is not None
     return replace(scan, points=points, sigma=(image.sigma.reshape(-1)[pixels] * stretch).astype(np.float32), normals=None,
-                   normals_source="unknown", colours=None if scan.colours is None else scan.colours[of_point],
+                   colours=None if scan.colours is None else scan.colours[of_point],
                    confidence=None if scan.confidence is None else scan.confidence[of_point], origin=np.zeros(3), camera=camera,
                    pixels=pixels, pose=scan.pose @ scan_from_camera, pose_covariance=None, targets=())  # these are of the frame before
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from kernels.fusion.resample import STEEPEST, STEP_SIGMAS
 from kernels.fusion.views import RangeImage
@@ -94,7 +95,7 @@ def prepare_scan(scan: Scan, folder: Path, voxel_m: float | None = None) -> Prep
         shift = PARALLEL_START_M - float((depth - STEP_SIGMAS * sigma)[mask].min())
         depth, camera_from_world = np.where(mask, depth + np.float32(shift), 0).astype(np.float32), camera_from_world.copy()
         camera_from_world[2, 3] -= float(np.float32(shift))
-    clear = _least_around(np.where(mask, depth - STEP_SIGMAS * sigma, 0))
+    clear = minimum_filter(np.where(mask, depth - STEP_SIGMAS * sigma, 0), 2 * CLEAR_PIXELS + 1, mode="constant")  # 0 beyond the image
     feather = np.clip(distance(np.pad(~cell, 1, constant_values=True))[1:-1, 1:-1] / FEATHER_PIXELS, 0, 1).astype(np.float32)
     distortion = camera.distortion
     layers = _layers(scan, maps, normal)
@@ -103,7 +104,7 @@ def prepare_scan(scan: Scan, folder: Path, voxel_m: float | None = None) -> Prep
                        stored("clear", clear), camera_from_world, focal_of(camera), camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p), orthographic=parallel)
     return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
-                        stored("feather", feather), scan.normals_source == "photometric",
+                        stored("feather", feather), scan.maps is not None,
                         _normal_sigma(maps), side)
 
 
@@ -146,14 +147,6 @@ def _stored(folder: Path, name: str, values: np.ndarray) -> Any:
     path = folder / f"{name}.npy"
     np.save(path, values)
     return np.load(path, mmap_mode="r")
-
-
-def _least_around(values: np.ndarray) -> np.ndarray:
-    """Return the least value within CLEAR_PIXELS of each pixel, 0 beyond the image."""
-    for axis in (0, 1):
-        wide = np.pad(values, [(CLEAR_PIXELS, CLEAR_PIXELS) if each == axis else (0, 0) for each in (0, 1)])
-        values = np.lib.stride_tricks.sliding_window_view(wide, 2 * CLEAR_PIXELS + 1, axis=axis).min(axis=-1)
-    return values
 
 
 def surface_cells(depth: np.ndarray, mask: np.ndarray, camera: Camera, sigma: np.ndarray) -> np.ndarray:

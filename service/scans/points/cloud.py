@@ -88,14 +88,10 @@ def _of_scan(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return scan.points.astype(np.float64), scan.directions(), scan.sigma.astype(np.float64) ** 2
 
 
-def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
+def cloud_of(thinned: Thinned, *, most: int) -> Cloud:
     """Return points with their normals, spacing and borders.
-
-    Args:
-        most: the most points that are matched with other scans; they are drawn evenly over the surface, and always the same.
-        threads: for the search of neighbours.
-    """
-    tree = Neighbours(thinned.points, threads=threads)
+    `most`: the most points that are matched with other scans; they are drawn evenly over the surface, and always the same."""
+    tree = Neighbours(thinned.points)
     index, distance = tree.nearest(thinned.points, NEIGHBOURS + 1)
     around = thinned.points[index] - thinned.points[:, None]
     normals, spread, mean = _planes(around, thinned.directions)

@@ -15,19 +15,19 @@ MOST_CELLS = 1 << 20
 class Neighbours:
     """A k-d tree of points."""
 
-    def __init__(self, points: np.ndarray, *, threads: int = 1) -> None:
-        """Build the tree of points [n, 3], metres; searches run on this many threads."""
+    def __init__(self, points: np.ndarray) -> None:
+        """Build the tree of points [n, 3], metres."""
         from small_gicp import KdTree
 
-        self._count, self._threads = len(points), threads
+        self._count = len(points)
         self._points, self._low = points, points.min(axis=0)
         self._extent = points.max(axis=0) - self._low
         self._near: dict[float, np.ndarray] = {}  # by the side of a cell, whether a point is in it or beside it
-        self._tree = KdTree(np.ascontiguousarray(points, dtype=np.float64), threads)
+        self._tree = KdTree(np.ascontiguousarray(points, dtype=np.float64))
 
     def nearest(self, points: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices [m, count] int64 of the nearest points of the tree to points [m, 3], nearest first, and their distances."""
-        index, squared = self._tree.batch_knn_search(np.ascontiguousarray(points, dtype=np.float64), min(count, self._count), self._threads)
+        index, squared = self._tree.batch_knn_search(np.ascontiguousarray(points, dtype=np.float64), min(count, self._count))
         return index.astype(np.int64), np.sqrt(squared)
 
     def may_be_near(self, points: np.ndarray, within: float) -> np.ndarray:

@@ -32,9 +32,7 @@ class Scan:
     sigma: np.ndarray  # [n] float32 metres, above 0: standard deviation of the place along the line of sight from `origin`
     sigma_source: str
     """`measured` (in the file), `declared` (in scan-set.json) or `estimated` (from the scatter around local planes)."""
-    normals: np.ndarray | None  # [n, 3] float32, unit, towards the camera; 0 where the neighbours determine none
-    normals_source: str
-    """`given` (in a PLY file), `photometric` (of solved maps), `estimated` (from the neighbours), or `unknown`."""
+    normals: np.ndarray | None  # [n, 3] float32, unit, those that a PLY file gives; 0 where it gives none
     colours: np.ndarray | None  # [n, 3] uint8, display-encoded (sRGB)
     confidence: np.ndarray | None  # [n] float32 0…1
     origin: np.ndarray  # [3] float64 metres: where the camera is in the scan's frame; an orthographic camera: any point above its image

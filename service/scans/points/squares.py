@@ -70,7 +70,7 @@ def coarser(scan: Scan, side: int) -> Scan:
         colours = np.rint(np.clip(display, 0, 1) * 255).astype(np.uint8)
     if scan.confidence is not None:
         confidence = _cut(scan.image(scan.confidence), side).mean(axis=(1, 3))[there]
-    return replace(scan, points=points, sigma=(found.sigma[there] * stretch).astype(np.float32), normals=None, normals_source="unknown",
+    return replace(scan, points=points, sigma=(found.sigma[there] * stretch).astype(np.float32), normals=None,
                    colours=colours, confidence=confidence, camera=found.camera, pixels=np.flatnonzero(there))
 
 

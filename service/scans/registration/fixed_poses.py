@@ -1,17 +1,16 @@
 """Compare the surfaces of scans with poses that are not to be moved."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from service.scans.points.rigid import inverse, step_between
-from service.scans.points.scan import Scan
-from service.scans.registration.extent import CELLS_ACROSS, extent_of
-from service.scans.registration.pair_tasks import NOT_THERE, START_CELLS
-from service.scans.registration.pairs import Pair, PairState, overlap_of, prepare, refine
+from service.scans.registration.extent import CELLS_ACROSS
+from service.scans.registration.pair_tasks import START_CELLS, PairTask
+from service.scans.registration.pairs import Pair, PairState
+from service.scans.registration.registration import Advance, ScanWork
 
 WRONG_SIGMAS, WRONG_PART = 5.0, 1e-4
 """A pair contradicts the poses if it differs by so many standard deviations and by this part of the extent of the scans, also as a turn."""
@@ -28,33 +27,21 @@ class FixedPoses(NamedTuple):
     """The part of `off` that noise does not explain."""
 
 
-def check_fixed(scans: Sequence[Scan], poses: Sequence[np.ndarray], *, threads: int, cell_m: float | None, least_overlap: float,
-                advance: Callable[[float], None] = lambda done: None) -> FixedPoses:
+def check_fixed(work: ScanWork, extents: Sequence[float], poses: Sequence[np.ndarray], *, cell_m: float | None, least_overlap: float,
+                advance: Advance = lambda done: None) -> FixedPoses:
     """Compare fixed poses, world_from_scan [4, 4], with what the surfaces of overlapping scans ask for.
 
     Args:
-        threads: pairs that are compared at one time.
+        extents: of the scans, as `extent_of` returns it.
         cell_m: side of the cells of the rough scale, metres; None: a sixtieth of the median extent of the scans.
         least_overlap: the least part of the smaller of two scans that must be matched.
         advance: told how far the work is, from 0 to 1.
     """
-    extent = float(np.median([extent_of(scan) for scan in scans]))
-    cell = cell_m or extent / CELLS_ACROSS
-    with ThreadPoolExecutor(threads) as pool:
-        ready = list(pool.map(lambda scan: prepare(scan, cell_m=cell), scans))
-
-        def one(numbers: tuple[int, int]) -> Pair:
-            a, b = (ready[k] for k in numbers)
-            start = inverse(poses[numbers[0]]) @ poses[numbers[1]]
-            if overlap_of(a, b, start, START_CELLS * cell) < least_overlap:
-                return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
-            return refine(a, b, start, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
-
-        numbers = list(combinations(range(len(scans)), 2))
-        pairs = []
-        for done, pair in enumerate(pool.map(one, numbers)):
-            pairs.append(pair)
-            advance((done + 1) / len(numbers))
+    extent = float(np.median(extents))
+    cells = dict.fromkeys(range(len(poses)), cell_m or extent / CELLS_ACROSS)
+    work.outlines(cells, lambda done: advance(0.15 * done))
+    tasks = [PairTask(a, b, inverse(poses[a]) @ poses[b], START_CELLS, may_search=False) for a, b in combinations(cells, 2)]
+    pairs = work.pairs(tasks, cells, least_overlap, lambda done: advance(0.15 + 0.85 * done))
     off, wrong = {}, {}
     for pair in pairs:
         if pair.state is not PairState.JOINED or pair.fit is None:

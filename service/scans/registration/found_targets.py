@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from service.calibrate.solvers.charuco import DICTIONARIES
+from service.calibrate.solvers.charuco import marker_detector
 from service.calibrate.solvers.procam import eight_bits, find_corners
 from service.scans.points.scan import Scan, Target
 from stage.spread import MAD_TO_SIGMA
@@ -44,10 +44,7 @@ def markers_in(image: np.ndarray, dictionary: str) -> list[ImagePoint]:
 
     A marker that is there twice is left out: nothing says which is which.
     """
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
-    found, numbers, _ = detector.detectMarkers(eight_bits(np.nan_to_num(image)))
+    found, numbers, _ = marker_detector(dictionary).detectMarkers(eight_bits(np.nan_to_num(image)))
     if numbers is None:
         return []
     every = [int(number) for number in np.ravel(numbers)]

@@ -130,11 +130,11 @@ def is_contradicted(found: Contradiction, *, started: bool = False) -> bool:
     return found.points > CONTRADICTED or found.surface > through or found.before_sets > BEFORE_SETS
 
 
-def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
+def prepare(scan: Scan, *, cell_m: float) -> Prepared:
     """Thin a scan to both scales and describe its rough points; cell_m is the side of the cells of the rough scale, metres."""
     thinned = thinned_scan(scan)
-    rough = cloud_of(rough_scan(scan, thinned, cell_m), most=ROUGH_POINTS, threads=threads)
-    fine = cloud_of(thinned, most=FINE_POINTS, threads=threads)
+    rough = cloud_of(rough_scan(scan, thinned, cell_m), most=ROUGH_POINTS)
+    fine = cloud_of(thinned, most=FINE_POINTS)
     return Prepared(rough=rough, fine=fine, features=fpfh(rough, FEATURE_CELLS * cell_m), image=depth_range(scan),
                     area=len(rough.points) * cell_m**2)
 

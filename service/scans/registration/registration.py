@@ -50,7 +50,7 @@ class RegistrationOptions:
     starts_decide: bool = False
     """Whether starts are taken in directions that the surfaces leave open, and although parts of the surfaces are seen through."""
     threads: int = 1
-    """Pairs that are registered at one time."""
+    """Pairs that `register` makes at one time."""
 
 
 class ScanWork(Protocol):

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from service.scans.points.scan import Scan
-from service.scans.read import read_scan, read_scans
+from service.scans.read import read_scan
 from stage.capture.camera import Camera
 from stage.errors import ManifestError, StageError
 from stage.formats.ply import PointCloud, write_ply
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from stage.sets.scan_set import read_scan_set
-from tests.scenes.joined import degrees_between
 
 SIZE, RADIUS, SIGMA = 96, 0.25, 2e-4
 CAMERAS = {"perspective": Camera(projection="perspective", resolution=(SIZE, SIZE), focal_px=(120.0, 120.0)),
@@ -49,30 +48,28 @@ def write(folder: Path, name: str, kind: str = "perspective", *, sigma: bool = T
 
 def read(folder: Path, *scans: dict) -> list[Scan]:
     (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "ball", "scans": list(scans)}))
-    return list(read_scans(*read_scan_set(folder)))
+    file, listed = read_scan_set(folder)
+    return [read_scan(file, listed, number) for number in range(len(listed.scans))]
 
 
 @pytest.mark.parametrize("kind", list(CAMERAS))
-def test_a_range_image_gives_points_sigma_normals_colours_and_its_grid(tmp_path, kind):
+def test_a_range_image_gives_points_sigma_colours_and_its_grid(tmp_path, kind):
     write(tmp_path, "a", kind)
     scan, = read(tmp_path, {"name": "a", "path": "a"})
     camera, (depth, mask) = CAMERAS[kind], sphere(CAMERAS[kind])
-    assert scan.camera == camera and scan.pixels is not None and scan.normals is not None and scan.colours is not None
+    assert scan.camera == camera and scan.pixels is not None and scan.normals is None and scan.colours is not None
     np.testing.assert_array_equal(scan.pixels, np.flatnonzero(mask))
     from_middle = scan.points + [0, 0, 1]
     np.testing.assert_allclose(np.linalg.norm(from_middle, axis=1), RADIUS, atol=1e-6)
     along = np.abs(scan.directions()[:, 2]) * scan.sigma  # σ along the ray has the σ of the z-depth as its part along z
     np.testing.assert_allclose(along, SIGMA, rtol=1e-4)
-    # at the rim the slope between neighbouring pixels reaches the 80 degrees that count as a break
-    off = degrees_between(scan.normals.T.astype(float), from_middle.T / RADIUS)[scan.normals.any(axis=1)]
-    assert np.percentile(off, 95) < 4 and scan.normals.any(axis=1).mean() > 0.95
-    assert scan.normals_source == "estimated" and scan.sigma_source == "measured"
+    assert scan.sigma_source == "measured"
     np.testing.assert_array_equal(scan.colours[:, 0], np.nonzero(mask)[0])
     np.testing.assert_allclose(scan.image(-scan.points[:, 2]), np.where(mask, depth, 0), rtol=1e-6)
     assert scan.pose is None and scan.maps is None
 
 
-def test_a_point_set_gives_points_in_metres_with_estimated_normals_and_sigma(tmp_path):
+def test_a_point_set_gives_points_in_metres_with_an_estimated_sigma(tmp_path):
     write(tmp_path, "a", noise=5e-4)
     source, = read(tmp_path, {"name": "a", "path": "a"})
     write_ply(PointCloud(1000 * source.points, np.zeros((len(source.points), 3), dtype=np.uint8)), tmp_path / "a.ply")
@@ -82,9 +79,7 @@ def test_a_point_set_gives_points_in_metres_with_estimated_normals_and_sigma(tmp
     scan, other = read(tmp_path, {"name": "a", "path": "a.ply", "unit": "mm", "scan_to_world": pose.tolist()},
                        {"name": "b", "path": "a.ply", "unit": "mm", "sigma_m": 3e-4})
     np.testing.assert_allclose(scan.points, source.points, rtol=1e-5, atol=1e-7)
-    assert scan.normals is not None and scan.normals_source == "estimated" and scan.sigma_source == "estimated"
-    facing = scan.normals.any(axis=1)
-    assert (np.einsum("ij,ij->i", scan.normals, scan.points)[facing] <= 0).all() and facing.mean() > 0.95
+    assert scan.normals is None and scan.sigma_source == "estimated"
     assert 3e-4 < scan.sigma[0] < 2e-3  # the noise along the normal is smaller than along the ray; the bend of the sphere adds
     assert scan.pose is not None and np.abs(scan.pose[:3, :3] @ scan.pose[:3, :3].T - np.eye(3)).max() < 1e-15
     assert other.sigma_source == "declared" and other.sigma[0] == np.float32(3e-4)
@@ -99,7 +94,7 @@ def test_the_pose_of_a_rig_is_taken_from_the_depth_result_where_the_set_gives_no
     np.testing.assert_array_equal(other.pose, np.eye(4))
 
 
-def test_solved_maps_of_the_same_camera_give_the_normals(tmp_path):
+def test_solved_maps_of_the_same_camera_stay_with_the_scan(tmp_path):
     write(tmp_path, "a", colours=False)
     _, mask = sphere(CAMERAS["perspective"])
     normal = np.zeros((SIZE, SIZE, 3), dtype=np.float32)
@@ -107,8 +102,7 @@ def test_solved_maps_of_the_same_camera_give_the_normals(tmp_path):
     (tmp_path / "solved").mkdir()
     SurfaceMaps(camera=CAMERAS["perspective"], mask=mask, normal=normal).write(tmp_path / "solved" / "maps.exr")
     scan, = read(tmp_path, {"name": "a", "path": "a/depth.exr", "maps": "solved"})
-    assert scan.normals is not None and scan.normals_source == "photometric" and scan.colours is None
-    np.testing.assert_array_equal(scan.normals, np.tile([0, 0, 1], (len(scan.points), 1)))
+    assert scan.maps == tmp_path / "solved" / "maps.exr" and scan.colours is None
 
 
 @pytest.mark.parametrize(("entry", "sentence"), [

@@ -67,7 +67,7 @@ def test_points_and_range_images_make_one_surface(tmp_path, clouds):
 def test_a_range_image_of_points_says_what_the_scanner_saw(tmp_path, clouds):
     """Each pixel lies on the true surface by what its σ says, in the world; σ is at most that of a point."""
     file, listed = read_scan_set(write_set(tmp_path, [entry(clouds[0], tmp_path, 0)]))
-    scan = as_range_image(read_scan(file, listed, 0, estimate_normals=False), "cloud 0", device="cpu")
+    scan = as_range_image(read_scan(file, listed, 0), "cloud 0", device="cpu")
     world = scan.points @ scan.pose[:3, :3].T + scan.pose[:3, 3]
     off = distance(world)
     assert np.sqrt(np.median(off**2)) < 0.6745 * SIGMA
@@ -87,7 +87,7 @@ def test_one_scan_of_a_wall_is_whole_whatever_the_voxels(tmp_path, voxel_pixels)
     pixel = 2 / np.sqrt(20000)
     file, listed = read_scan_set(write_set(tmp_path, [entry(wall, tmp_path, 0)]))
     voxel = None if voxel_pixels is None else voxel_pixels * pixel
-    scan = as_range_image(read_scan(file, listed, 0, estimate_normals=False), "wall", voxel, device="cpu")
+    scan = as_range_image(read_scan(file, listed, 0), "wall", voxel, device="cpu")
     inside = np.zeros((scan.camera.height, scan.camera.width), dtype=bool)
     inside.flat[scan.pixels] = True
     assert inside[3:-3, 3:-3].mean() > 0.995
@@ -145,7 +145,7 @@ def test_normals_that_point_away_from_the_viewpoint_are_refused(tmp_path, clouds
     write_ply(PointCloud((MM * clouds[0].points).astype(np.float32), clouds[0].colours, normals), tmp_path / said["path"])
     read, listed = read_scan_set(write_set(tmp_path, [said]))
     with pytest.raises(RequestError, match=r"\d\d% of its normals point away from viewpoint_m"):
-        as_range_image(read_scan(read, listed, 0, estimate_normals=False), "cloud 0", device="cpu")
+        as_range_image(read_scan(read, listed, 0), "cloud 0", device="cpu")
 
 
 def test_registered_scans_keep_their_viewpoints(tmp_path):

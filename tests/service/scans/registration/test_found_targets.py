@@ -74,7 +74,7 @@ def look(kind: str, pose: np.ndarray, *, seed: int, upside_down: bool = False) -
     points = CAMERA.points(-depth).reshape(-1, 3)[pixels]
     stretch = np.linalg.norm(points, axis=1) / -points[:, 2]
     scan = Scan(name="wall", path=Path("wall"), points=points, sigma=(SIGMA * stretch).astype(np.float32), sigma_source="measured",
-                normals=None, normals_source="unknown", colours=None, confidence=None, origin=np.zeros(3), camera=CAMERA, pixels=pixels,
+                normals=None, colours=None, confidence=None, origin=np.zeros(3), camera=CAMERA, pixels=pixels,
                 pose=None, pose_covariance=None, maps=None)
     return image.astype(np.float32), scan
 

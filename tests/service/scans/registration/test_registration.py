@@ -33,7 +33,7 @@ def scan_of(view: View, *, points_only: bool = False) -> Scan:
     x, y = camera.plane_coordinates()
     sigma = view.sigma.reshape(-1)[pixels] * np.sqrt(1 + x**2 + y**2).reshape(-1)[pixels]
     return Scan(name=f"at {view.world_from_scan[0, 0]:.3f}", path=Path("scan"), points=camera.points(-view.depth).reshape(-1, 3)[pixels],
-                sigma=sigma.astype(np.float32), sigma_source="measured", normals=None, normals_source="unknown",
+                sigma=sigma.astype(np.float32), sigma_source="measured", normals=None,
                 colours=None, confidence=None, origin=np.zeros(3), camera=None if points_only else camera,
                 pixels=None if points_only else pixels, pose=None, pose_covariance=None, maps=None)
 

@@ -32,7 +32,7 @@ def plate(height, left_m: float, seed: int) -> Scan:
     sight = (points - origin) / np.linalg.norm(points - origin, axis=1)[:, None]
     points += sight * random.normal(0, SIGMA, len(points))[:, None]
     return Scan(name=f"from {left_m:g} m", path=Path("scan"), points=points, sigma=np.full(len(points), SIGMA, np.float32),
-                sigma_source="measured", normals=None, normals_source="unknown", colours=None, confidence=None, origin=origin,
+                sigma_source="measured", normals=None, colours=None, confidence=None, origin=origin,
                 camera=None, pixels=None, pose=None, pose_covariance=None, maps=None)
 
 

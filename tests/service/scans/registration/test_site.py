@@ -29,7 +29,7 @@ def scan_of(number: int, camera: Camera, pose: np.ndarray, sigma: float, range_m
     depth = true + sigma * np.random.default_rng(number).standard_normal(true.shape)
     points = camera.points(-depth)[mask].astype(np.float32)
     return Scan(name=str(number), path=Path("scan"), points=points, sigma=np.full(len(points), sigma, np.float32), sigma_source="measured",
-                normals=None, normals_source="unknown", colours=None, confidence=None, origin=np.zeros(3), camera=camera,
+                normals=None, colours=None, confidence=None, origin=np.zeros(3), camera=camera,
                 pixels=np.flatnonzero(mask), pose=pose, pose_covariance=None, maps=None)
 
 

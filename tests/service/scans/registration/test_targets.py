@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from service.scans.points.rigid import applied, exponential, inverse, step_between
+from service.scans.points.rigid import applied, inverse, step_between
 from service.scans.points.scan import Scan, Target
 from service.scans.registration.pairs import Evidence, PairState
 from service.scans.registration.registration import Registration, RegistrationOptions, register
@@ -93,7 +94,7 @@ def test_targets_on_the_table_do_not_move_an_object_that_was_pushed():
 def pair_of(places_b: dict[str, np.ndarray], seed: int = 0, names: tuple[str, ...] = tuple(PLACES)) -> tuple[TargetPose, np.ndarray]:
     rng = np.random.default_rng(seed)
     truth = np.eye(4)
-    truth[:3, :3], truth[:3, 3] = exponential(rng.standard_normal(3)), rng.standard_normal(3)
+    truth[:3, :3], truth[:3, 3] = Rotation.from_rotvec(rng.standard_normal(3)).as_matrix(), rng.standard_normal(3)
     a = targets_of(np.eye(4), 2 * seed, {name: PLACES[name] for name in names})
     return pose_by_targets(a, targets_of(truth, 2 * seed + 1, places_b), first_row=(0, 0)), truth
 
