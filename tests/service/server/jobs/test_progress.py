@@ -7,16 +7,14 @@ import pytest
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.jobs import progress
-from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.context import Job
 from service.server.jobs.pieces import JobPieces
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.storage import layout
-from service.server.storage.objects import open_storage
 from stage.errors import StorageError
 from stage.files import replacing
 from tests.service.server.jobs.harness import harness
@@ -27,7 +25,7 @@ def claim(tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     monkeypatch.setattr(progress, "UNANSWERED_S", 0.0)
     with harness(tmp_path) as made:
-        job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+        job = made.two_steps()
         claim = Claim(job, 1, "one")
         jobs.begin(made.database, claim)
         yield made, claim
@@ -119,11 +117,8 @@ def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
 @pytest.fixture
 def running(idle_harness, monkeypatch):
     """The pieces of a job that another worker does; the folder of a piece is deleted while it is written."""
-    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
-    idle_harness.take(job, "one")
-    jobs.begin(idle_harness.database, Claim(job, 1, "one"))
-    context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1,
-                            idle_harness.settings.roots_of)
+    job = idle_harness.two_steps()
+    idle_harness.claim(job, "one")
 
     @contextmanager
     def in_a_folder_that_goes(file):
@@ -132,7 +127,7 @@ def running(idle_harness, monkeypatch):
             yield temporary
 
     monkeypatch.setattr("service.server.jobs.pieces.replacing", in_a_folder_that_goes)
-    return JobPieces(context, Job.of(dict(idle_harness.row(job)))), job
+    return JobPieces(idle_harness.context(), Job.of(dict(idle_harness.row(job)))), job
 
 
 def test_a_piece_of_a_job_that_was_cancelled_meanwhile_is_no_fault(idle_harness, running):

@@ -12,10 +12,9 @@ from service.requests.jobs import CheckJob, SolveJob
 from service.requests.light.frame_range import numbered
 from service.requests.solve import SolveOptions
 from service.server.database import intakes
-from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.context import Job
 from service.server.jobs.steps import _parts, steps_of
 from service.server.storage import layout
-from service.server.storage.objects import open_storage
 from stage.errors import StageError
 from stage.formats import exr, images
 from tests.scenes.captures import make_scene, write_capture
@@ -42,8 +41,7 @@ def step_of(harness, capture, roots):
 
 
 def only_step(harness, request, roots, settings=None):
-    context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 64,
-                            lambda project: roots, settings=settings)
+    context = harness.context(*roots)._replace(settings=settings)
     step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, request, 1), context)
     return step
 
