@@ -20,10 +20,11 @@ from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.early_ingest import PREVIEW_FILE
 from service.acquisition.plans.plan import read_plan
 from service.requests.acquire import AcquireRequest
-from tests.service.acquisition.scenes import KINDS, ROOT, Scene, named, owl, owl_on_stage, relief
+from tests.service.acquisition.scenes import KINDS, Scene, named, owl, owl_on_stage, relief
 from tests.service.acquisition.test_acquire import faults_at_random
 from tests.service.acquisition.twin_in_process import TwinInProcess, wanted
 from tests.service.acquisition.twin_in_process import named as names_of
+from tests.service.twin_program import ROOT
 
 SEEDS = range(20)
 TWIN_SEEDS = range(6)

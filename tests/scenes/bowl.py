@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.reference.sampling import lattice
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import write_lit
 
 ALBEDO = np.array([0.8, 0.64, 0.48])
 HALF_DEGREES = 70.0
@@ -72,16 +72,6 @@ def write_near(folder: Path, scene: Bowl, count: int, radii: float, *, bounced: 
     images, lights = [], []
     for lamp in radii * lattice(count, 75.0):
         arriving = under_lamp(WALL, lamp, radii**2).mean() if bounced else 0.0
-        images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), arriving))
+        images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), arriving) * scene.mask[..., None])
         lights.append({"type": "point", "position_m": lamp.tolist(), "intensity": [radii**2] * 3})
-    return write(folder, scene, images, lights)
-
-
-def write(folder: Path, scene: Bowl, images: list[np.ndarray], lights: list[dict[str, Any]]) -> Path:
-    frames = []
-    for index, (image, light) in enumerate(zip(images, lights, strict=True)):
-        write_exr(folder / f"{index:03d}.exr", image * scene.mask[..., None])
-        frames.append({"image": f"{index:03d}.exr", "light": light})
-    write_image(folder / "mask.png", (scene.mask * 255).astype(np.uint8))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "bowl", "mask": "mask.png", "camera": scene.camera, "frames": frames})
-    return folder
+    return write_lit(folder, images, lights, camera=scene.camera, mask=scene.mask, name="bowl")

@@ -2,7 +2,7 @@
 OpenEXR and json alone, so that nothing here leans on the code that it judges."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,6 +109,29 @@ def write_manifest(folder: Path, data: dict[str, Any]) -> Path:
     path = folder / "capture.json"
     path.write_text(json.dumps(data), encoding="utf-8")
     return path
+
+
+def distant(direction: np.ndarray, irradiance: float | np.ndarray) -> dict[str, Any]:
+    """The entry of a distant light from a unit direction [3], of this irradiance in each channel or [3]."""
+    return {"type": "distant", "direction": direction.tolist(), "irradiance": np.broadcast_to(irradiance, 3).astype(float).tolist()}
+
+
+def write_lit(folder: Path, images: Iterable[np.ndarray], lights: Iterable[dict[str, Any]], *, camera: dict[str, Any],
+              mask: np.ndarray | None = None, names: str = "{:03d}.exr", **changes: Any) -> Path:
+    """Write a capture of images [rows, cols, 3], each under the light of its entry; the mask [rows, cols] is bool, or coverage in 16 bits.
+
+    Returns:
+        The folder.
+    """
+    frames = []
+    for index, (image, light) in enumerate(zip(images, lights, strict=True)):
+        write_exr(folder / names.format(index), image)
+        frames.append({"image": names.format(index), "light": light})
+    if mask is not None:
+        write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
+        changes = {"mask": "mask.png", **changes}
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "cap", "camera": camera, "frames": frames, **changes})
+    return folder
 
 
 def write_capture(folder: Path, scene: Scene | None = None, *, dtype: type[np.floating] = np.float32, **changes: Any) -> Path:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from tests.scenes.captures import write_exr, write_manifest
+from tests.scenes.captures import write_lit
 
 PITCH, PATCH = 47.0, 40.0
 """Millimetres from patch to patch, and the side of one, of the printed chart of 24."""
@@ -93,13 +93,10 @@ def poses(count: int) -> list[Pose]:
 def shoot(folder: Path, images: list[np.ndarray], lights: list[dict] | None = None, **manifest) -> Path:
     """A capture of images [rows, cols, 3], each under a distant light from the camera, or one of these."""
     light = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
-    for number, image in enumerate(images):
-        write_exr(folder / f"{number}.exr", image)
     rows, cols = images[0].shape[:2]
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "chart", "color_space": "lin_rec709_scene", "camera": {
-        "projection": "orthographic", "resolution": [cols, rows]},
-        "frames": [{"image": f"{number}.exr", "light": each} for number, each in enumerate(lights or [light] * len(images))], **manifest})
-    return folder
+    camera = {"projection": "orthographic", "resolution": [cols, rows]}
+    return write_lit(folder, images, lights or [light] * len(images), names="{}.exr", **{
+        "name": "chart", "color_space": "lin_rec709_scene", "camera": camera, **manifest})
 
 
 def homography(pose: Pose, size: tuple[int, int], grid: tuple[int, int], pitch: float = PITCH) -> np.ndarray:

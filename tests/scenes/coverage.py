@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.reference.sampling import lattice
+from tests.scenes.captures import distant, write_lit
 
 RAYS = 8
 """Rays along each side of a pixel: the coverage is exact to 1/64."""
@@ -34,9 +35,7 @@ def render_covered(size: int = 48, lights: int = 24, *, radii: tuple[float, floa
         background: reflectance of a wall behind, on which the ellipsoid throws shadows that move with the light; 0 is black.
         hole: radius of a round hole in the middle, half an image.
     """
-    index = np.arange(lights) + 0.5
-    z, turn = 1 - (1 - lowest) * index / lights, np.pi * (1 + 5**0.5) * index
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=-1)
+    directions = lattice(lights, np.degrees(np.arccos(lowest)))
     centre = (np.arange(size * RAYS) + 0.5) / (size * RAYS) * 2 - 1
     x, y = np.meshgrid(centre, -centre)
     cosine, sine = np.cos(0.4), np.sin(0.4)
@@ -71,15 +70,8 @@ def render_covered(size: int = 48, lights: int = 24, *, radii: tuple[float, floa
 
 
 def write_covered(folder, scene: Covered, mask, *, cut=False):
-    """Write a capture of a rendered outline with noise; `mask` is bool, or coverage that is written with 16 bits; `cut`: black outside."""
+    """Write a capture of a rendered outline with noise; `mask` is bool, or coverage; `cut`: black outside."""
     noise = np.random.default_rng(2).normal(0, NOISE, scene.images.shape)
-    for index, image in enumerate(np.maximum(scene.images + noise, 0)):
-        write_exr(folder / f"{index:03d}.exr", image * mask[..., None] if cut else image)
-    write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
-    size = len(mask)
-    write_manifest(folder, {
-        "schema": "relit.capture/1", "name": "cap", "mask": "mask.png",
-        "camera": {"projection": "orthographic", "resolution": [size, size]},
-        "frames": [{"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction, "irradiance": [np.pi] * 3}}
-                   for index, direction in enumerate(scene.directions.tolist())]})
-    return folder
+    images = np.maximum(scene.images + noise, 0) * (mask[..., None] if cut else 1)
+    return write_lit(folder, images, [distant(direction, np.pi) for direction in scene.directions], mask=mask,
+                     camera={"projection": "orthographic", "resolution": list(mask.shape)})

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.reference import sampling as twin
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import write_lit
 
 SHARPNESS = 6.0
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -42,14 +42,8 @@ def write_sampling(folder: Path, scene: Ball, radiance: np.ndarray, centres: np.
                    **changes: Any) -> Path:
     """Write a capture of the masked pixels' radiance [n, lights, 3]."""
     lights = lights or [light(centre) for centre in centres]
-    frames = []
-    for index, given in enumerate(lights):
-        image = np.zeros((*scene.mask.shape, 3))
-        image[scene.mask] = radiance[:, index]
-        write_exr(folder / f"{index:03d}.exr", image)
-        frames.append({"image": f"{index:03d}.exr", "light": given})
-    write_image(folder / "mask.png", (scene.mask * 255).astype(np.uint8))
+    images = np.zeros((len(lights), *scene.mask.shape, 3))
+    images[:, scene.mask] = np.moveaxis(radiance, 1, 0)
     rows, cols = scene.mask.shape
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "ball", "mask": "mask.png", "frames": frames,
-                            "camera": {"projection": "orthographic", "resolution": [cols, rows]}, **changes})
-    return folder
+    return write_lit(folder, images, lights, mask=scene.mask, **{
+        "name": "ball", "camera": {"projection": "orthographic", "resolution": [cols, rows]}, **changes})

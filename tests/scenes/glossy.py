@@ -1,7 +1,6 @@
 """A glossy dome under lights all around it, rendered with the float64 twin of the contract's model, and its true maps: what model-guided
 relighting and shading are judged on. The dome is convex, so that nothing throws a shadow but attached ones."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,7 @@ import numpy as np
 from stage.capture.camera import Camera
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from tests.reference import microfacet
-from tests.scenes.captures import write_exr, write_image
+from tests.scenes import captures
 
 VIEW = np.array([0.0, 0.0, 1.0])
 PIXEL_M = 0.001
@@ -83,16 +82,9 @@ def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: flo
 def write_lit(folder: Path, mask: np.ndarray, directions: np.ndarray, seen: Callable[[np.ndarray], np.ndarray], *,
               irradiance: float) -> None:
     """Write a capture of distant lights: `seen` is the image [rows, cols, 3] under each of their directions."""
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = []
-    for index, direction in enumerate(directions):
-        write_exr(folder / f"{index:03d}.exr", seen(direction))
-        frames.append({"image": f"{index:03d}.exr",
-                       "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [irradiance] * 3}})
-    write_image(folder / "mask.png", (mask * 255).astype(np.uint8))
-    manifest = {"schema": "relit.capture/1", "name": "dome", "color_space": "lin_rec709_scene", "mask": "mask.png", "frames": frames,
-                "camera": {"projection": "orthographic", "resolution": list(mask.shape[::-1]), "pixel_size_m": PIXEL_M}}
-    (folder / "capture.json").write_text(json.dumps(manifest))
+    captures.write_lit(folder, map(seen, directions), [captures.distant(direction, irradiance) for direction in directions], mask=mask,
+                       name="dome", color_space="lin_rec709_scene",
+                       camera={"projection": "orthographic", "resolution": list(mask.shape[::-1]), "pixel_size_m": PIXEL_M})
 
 
 def write_maps(folder: Path, surface: Dome, camera: Camera | None = None, **changes: np.ndarray | str | None) -> Path:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.reference import sampling as twin
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import write_lit
 
 RIM, ALBEDO, SHARPNESS = 0.95, 0.3, 6.0
 STEPS, LATTICE = 64, 1000
@@ -60,16 +60,11 @@ def write(folder: Path, scene: Horn, sources: int) -> Path:
     directions = twin.lattice(LATTICE)
     told = np.round(directions / np.linalg.norm(directions, axis=1, keepdims=True), 9)
     seen, steradians = cosines(scene, directions), 4 * np.pi / LATTICE
-    frames = []
-    for index, centre in enumerate(twin.lattice(sources)):
+    images, lights = np.zeros((sources, *scene.mask.shape, 3)), []
+    for image, centre in zip(images, twin.lattice(sources), strict=True):
         radiance = np.exp(SHARPNESS * (directions @ centre - 1))
         lit = radiance > 0.02
-        image = np.zeros((*scene.mask.shape, 3))
         image[scene.mask] = (ALBEDO / np.pi * seen[:, lit] @ radiance[lit] * steradians)[:, None]
-        write_exr(folder / f"{index:03d}.exr", image)
-        frames.append({"image": f"{index:03d}.exr", "light": {
-            "type": "extended", "directions": told[lit].tolist(), "radiance": np.repeat(radiance[lit, None], 3, axis=1).tolist(),
-            "solid_angle": [steradians] * int(lit.sum())}})
-    write_image(folder / "mask.png", (scene.mask * 255).astype(np.uint8))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "horn", "mask": "mask.png", "camera": scene.camera, "frames": frames})
-    return folder
+        lights.append({"type": "extended", "directions": told[lit].tolist(), "radiance": np.repeat(radiance[lit, None], 3, axis=1).tolist(),
+                       "solid_angle": [steradians] * int(lit.sum())})
+    return write_lit(folder, images, lights, camera=scene.camera, mask=scene.mask, name="horn")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
-from tests.scenes.statue import Shot, place, shoot
+from tests.scenes.statue import Shot, box, capsule, place, shoot
 
 WAVE, DEEP = 90.0, 6e-4
 """Radians per metre and metres of the waves on all surfaces: slopes of up to 3°."""
@@ -21,22 +21,17 @@ LIPSCHITZ = 0.9
 Field = Callable[[np.ndarray], np.ndarray]
 
 
-def _box(p: np.ndarray, centre: tuple, half: tuple) -> np.ndarray:
-    q = np.abs(p - np.array(centre)) - np.array(half)
-    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
-
-
 def _waved(distance: np.ndarray, p: np.ndarray) -> np.ndarray:
     return distance - DEEP * np.sin(WAVE * p[..., 0]) * np.cos(WAVE * p[..., 1] + 1)
 
 
 def _wall(p: np.ndarray) -> np.ndarray:
-    return _box(p, (0, 0, -0.02), (0.16, 0.16, 0.02))
+    return box(p, (0, 0, -0.02), (0.16, 0.16, 0.02))
 
 
 def plates(p: np.ndarray) -> np.ndarray:
     """A plate of 10 mm that stands 6 mm before a larger one."""
-    return _waved(np.minimum(_wall(p), _box(p, (0.01, 0, 0.011), (0.07, 0.07, 0.005))), p)
+    return _waved(np.minimum(_wall(p), box(p, (0.01, 0, 0.011), (0.07, 0.07, 0.005))), p)
 
 
 def disc(p: np.ndarray) -> np.ndarray:
@@ -51,15 +46,13 @@ def disc(p: np.ndarray) -> np.ndarray:
 def step(p: np.ndarray) -> np.ndarray:
     """A step of 15 mm across a wall, at no angle to the lattice that would be special."""
     turn = Rotation.from_rotvec(np.radians([0.0, 0.0, 17.0])).as_matrix()
-    block = np.maximum(_box(p @ turn, (0.3, 0, 0), (0.3, 0.3, 0.015)), _box(p, (0, 0, 0), (0.16, 0.16, 0.02)))
+    block = np.maximum(box(p @ turn, (0.3, 0, 0), (0.3, 0.3, 0.015)), box(p, (0, 0, 0), (0.16, 0.16, 0.02)))
     return _waved(np.minimum(_wall(p), block), p)
 
 
 def rod(p: np.ndarray) -> np.ndarray:
     """A rod of 12 mm, 20 mm before a wall."""
-    a, b = np.array([-0.08, -0.12, 0.026]), np.array([0.09, 0.12, 0.03])
-    along = np.clip(((p - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
-    return _waved(np.minimum(_wall(p), np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1) - 0.006), p)
+    return _waved(np.minimum(_wall(p), capsule(p, (-0.08, -0.12, 0.026), (0.09, 0.12, 0.03), 0.006)), p)
 
 
 CHAIR = [((-0.05, -0.06, 0.02), (0.005, 0.05, 0.005)), ((0.05, -0.06, 0.02), (0.005, 0.05, 0.005)),
@@ -75,7 +68,7 @@ def chair(p: np.ndarray) -> np.ndarray:
     bent = np.maximum(0.29 - np.hypot(p[..., 0], p[..., 2] - 0.27), np.maximum(np.abs(p[..., 0]) - 0.16, np.abs(p[..., 1]) - 0.15))
     bent = np.maximum(bent, np.maximum(p[..., 2] - 0.12, -0.06 - p[..., 2]))
     q = (p - [0, 0, 0.07]) @ Rotation.from_rotvec(np.radians([14.0, -23.0, 6.0])).as_matrix()
-    return _waved(np.min([bent, *(_box(q, centre, half) for centre, half in CHAIR)], axis=0), p)
+    return _waved(np.min([bent, *(box(q, centre, half) for centre, half in CHAIR)], axis=0), p)
 
 
 SCENES: dict[str, Field] = {"plates": plates, "disc": disc, "step": step, "rod": rod, "chair": chair}

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.scenes.captures import ring, write_exr, write_image, write_manifest
+from tests.scenes.captures import distant, ring, write_lit
 
 WAVES = 60
 RADIUS = 0.38
@@ -81,19 +81,11 @@ def write_moving(folder: Path, subject: Subject, order: str = "TLLLLTLLLLT", **c
     tracking = [time for time, kind in enumerate(order) if kind == "T"]
     middle = tracking[len(tracking) // 2] if tracking else 0
     directions = iter(ring(order.count("L")))
-    frames = []
+    images, lights = [], []
     for time, kind in enumerate(order):
-        name = f"{time:02d}.exr"
-        if kind == "T":
-            write_exr(folder / name, subject.full(time - middle))
-            frames.append({"image": name, "light": {"type": "full"}})
-        else:
-            direction = next(directions)
-            write_exr(folder / name, subject.lit(time - middle, direction))
-            light = {"type": "distant", "direction": direction.tolist(), "irradiance": [float(np.pi)] * 3}
-            frames.append({"image": name, "light": light})
-    write_image(folder / "mask.png", (subject.mask(0) * 255).astype(np.uint8))
+        direction = None if kind == "T" else next(directions)
+        images.append(subject.full(time - middle) if direction is None else subject.lit(time - middle, direction))
+        lights.append({"type": "full"} if direction is None else distant(direction, np.pi))
     camera = {"projection": "orthographic", "resolution": [subject.size, subject.size]}
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "dancer", "mask": "mask.png", "camera": camera, "frames": frames,
-                            **changes})
-    return folder
+    return write_lit(folder, images, lights, names="{:02d}.exr", **{
+        "name": "dancer", "mask": subject.mask(0), "camera": camera, **changes})

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.reference.sampling import lattice
+from tests.scenes.captures import distant, write_lit
 
 CAP = 0.8
 """Radius of the visible cap in sphere radii."""
@@ -27,7 +28,7 @@ class Lamp(NamedTuple):
 
     def manifest(self) -> dict[str, Any]:
         if self.direction is not None:
-            return {"type": "distant", "direction": self.direction.tolist(), "irradiance": self.strength.tolist()}
+            return distant(self.direction, self.strength)
         given = {"type": "point", "position_m": self.position.tolist(), "intensity": self.strength.tolist()}
         return given if self.axis is None else {**given, "axis": self.axis.tolist(), "anisotropy": self.exponent}
 
@@ -89,12 +90,8 @@ def dome(size: int = 48, *, perspective: bool = False, radius: float = 0.1) -> D
 def lamps(scene: Dome, count: int, radii: float, *, widest: float = 75.0, exponent: float = 0.0) -> list[Lamp]:
     """Lamps on a cap of a sphere about the dome's, of different colours; with an exponent they look beside the centre."""
     index = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(widest))) * index / count
-    turn = np.pi * (1 + 5**0.5) * index
-    ring = np.sqrt(1 - z**2)
-    way = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
     strength = (1 + 0.1 * np.arange(3 * count).reshape(count, 3) % 0.7) * (radii * scene.radius) ** 2
-    positions = scene.centre + radii * scene.radius * way
+    positions = scene.centre + radii * scene.radius * lattice(count, widest)
     looked_at = 0.4 * scene.radius * np.stack([np.sin(5 * index), np.cos(3 * index), np.ones(count)], axis=-1) + scene.centre
     aim = looked_at - positions
     aim /= np.linalg.norm(aim, axis=1, keepdims=True)
@@ -129,11 +126,5 @@ def render(scene: Dome, lamp: Lamp, *, cast_steps: int = 0) -> np.ndarray:
 
 def write(folder: Path, scene: Dome, lights: list[Lamp], *, told: list[Lamp] | None = None, cast_steps: int = 0) -> Path:
     """A capture of the dome under these lamps; told: what the manifest says of them, if not the truth."""
-    frames = []
-    for index, (lamp, said) in enumerate(zip(lights, told or lights, strict=True)):
-        write_exr(folder / f"{index:03d}.exr", render(scene, lamp, cast_steps=cast_steps) * scene.mask[..., None])
-        frames.append({"image": f"{index:03d}.exr", "light": said.manifest()})
-    write_image(folder / "mask.png", (scene.mask * 255).astype(np.uint8))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "dome", "mask": "mask.png", "camera": scene.camera,
-                            "frames": frames})
-    return folder
+    images = (render(scene, lamp, cast_steps=cast_steps) * scene.mask[..., None] for lamp in lights)
+    return write_lit(folder, images, [said.manifest() for said in told or lights], camera=scene.camera, mask=scene.mask, name="dome")

@@ -1,4 +1,4 @@
-"""Small rigs and cues, written with json alone; and an address of the loopback for each process of a test run."""
+"""Small rigs, plans and cues, written with json alone; and an address of the loopback for each process of a test run."""
 
 import json
 import os
@@ -24,6 +24,13 @@ def write_rig_file(path: Path, directions: np.ndarray, *, host: str | None, univ
     """A rig of RGB lamps in these directions, dealt to universes in turn; with a master dimmer on this channel of each."""
     write_rig(path, directions, {name: [0.05 + (c == k) for c in range(3)] for k, name in enumerate("rgb")}, host=host, universes=universes,
               names="lamp {}", fixed=() if dimmer is None else ({"name": "Dimmer", "channel": dimmer, "value": 255},), **options)
+    return path
+
+
+def write_plan(folder: Path, *sequences: dict[str, Any], settle_s: float = 0, **fields: Any) -> Path:
+    """A plan of these sequences, plan.json."""
+    path = folder / "plan.json"
+    path.write_text(json.dumps({"schema": "relit.plan/1", "settle_s": settle_s, "sequences": sequences, **fields}))
     return path
 
 

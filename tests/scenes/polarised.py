@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.reference import microfacet
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import distant, write_exr, write_image, write_manifest
 from tests.scenes.glossy import PIXEL_M, VIEW, Dome, dome, sphere_directions
 
 MATERIALS = {  # albedo, F0, roughness of the quarters of the dome
@@ -87,16 +87,13 @@ def write_polarised(folder: Path, scene: PolarisedScene, *, leak: float = 0.0, d
     """Write a cross and a parallel image of every light, with noise of σ² = noise² (L² + 0.01 L_white L) that may fall below zero."""
     random = np.random.default_rng(seed)
     frames = []
-    white = IRRADIANCE / np.pi
 
     def add(name: str, image: np.ndarray, light: dict[str, object], exposure: float | None) -> None:
-        sigma = noise * np.sqrt(image**2 + 0.01 * white * image + 1e-4 * white**2)
-        recorded = (image + sigma * random.normal(size=image.shape)) * (exposure or 1.0)
-        write_exr(folder / name, recorded + PEDESTAL)
+        write_exr(folder / name, _noisy(image, noise, random) * (exposure or 1.0) + PEDESTAL)
         frames.append({"image": name, "light": light} | ({} if exposure is None else {"exposure_s": exposure}))
 
     for index, direction in enumerate(scene.directions):
-        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [IRRADIANCE] * 3}
+        light = distant(direction, IRRADIANCE)
         half, shine = scene.diffuse[index] / 2, scene.specular[index]
         for step, exposure in enumerate(exposures or (None,)):
             add(f"{index:03d}_{step}_cross.exr", half + leak * shine, light | {"polarization": "cross"}, exposure)
@@ -106,14 +103,16 @@ def write_polarised(folder: Path, scene: PolarisedScene, *, leak: float = 0.0, d
 
 def write_plain(folder: Path, scene: PolarisedScene, *, noise: float = 0.0, seed: int = 0) -> Path:
     """Write the images of a camera without polariser, which gather the light of both images of a pair."""
-    random, white, frames = np.random.default_rng(seed), IRRADIANCE / np.pi, []
+    random, frames = np.random.default_rng(seed), []
     for index, direction in enumerate(scene.directions):
-        image = scene.diffuse[index] + scene.specular[index]
-        sigma = noise * np.sqrt(image**2 + 0.01 * white * image + 1e-4 * white**2)
-        write_exr(folder / f"{index:03d}.exr", image + sigma * random.normal(size=image.shape) + PEDESTAL)
-        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [IRRADIANCE] * 3}
-        frames.append({"image": f"{index:03d}.exr", "light": light})
+        write_exr(folder / f"{index:03d}.exr", _noisy(scene.diffuse[index] + scene.specular[index], noise, random) + PEDESTAL)
+        frames.append({"image": f"{index:03d}.exr", "light": distant(direction, IRRADIANCE)})
     return _finish(folder, scene, frames, {})
+
+
+def _noisy(image: np.ndarray, noise: float, random: np.random.Generator) -> np.ndarray:
+    white = IRRADIANCE / np.pi
+    return image + noise * np.sqrt(image**2 + 0.01 * white * image + 1e-4 * white**2) * random.normal(size=image.shape)
 
 
 def _finish(folder: Path, scene: PolarisedScene, frames: list[dict[str, object]], changes: dict[str, object]) -> Path:

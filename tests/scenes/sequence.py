@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.reference.sampling import lattice
-from tests.scenes.captures import write_exr, write_manifest
+from tests.scenes.captures import distant, write_exr, write_lit
 
 SIZE = 64
 LIGHTS = 12
@@ -56,19 +56,15 @@ def moment(place: float | None, *, other: bool = False, size: int = SIZE) -> Mom
 def write_step(folder: Path, scene: Moment, *, seed: int, noise: float = 0.01, brightness: float | np.ndarray = 1.0,
                **changes: object) -> Path:
     """Write the capture of a step, with noise of this part of the brightest value; its lights are this much brighter than they say."""
-    random, frames = np.random.default_rng(seed), []
-    size = len(scene.normal)
-    for index, direction in enumerate(lattice(LIGHTS, 50)):
-        image = np.broadcast_to(brightness, LIGHTS)[index] * scene.albedo * np.maximum(scene.normal @ direction, 0)[..., None]
-        image = image + noise * random.normal(size=image.shape) * np.sqrt(image + 0.02) + PEDESTAL
-        write_exr(folder / f"{index:02d}.exr", image)
-        light = {"type": "distant", "direction": direction.tolist(), "irradiance": [np.pi] * 3}
-        frames.append({"image": f"{index:02d}.exr", "light": light})
+    random, images = np.random.default_rng(seed), []
+    size, directions = len(scene.normal), lattice(LIGHTS, 50)
+    for strength, direction in zip(np.broadcast_to(brightness, LIGHTS), directions, strict=True):
+        image = strength * scene.albedo * np.maximum(scene.normal @ direction, 0)[..., None]
+        images.append(image + noise * random.normal(size=image.shape) * np.sqrt(image + 0.02) + PEDESTAL)
     write_exr(folder / "dark.exr", np.full((size, size, 3), PEDESTAL))
     camera = {"projection": "orthographic", "resolution": [size, size], "pixel_size_m": PIXEL_M}
-    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "dark": "dark.exr", "camera": camera, "frames": frames,
-                            **changes})
-    return folder
+    return write_lit(folder, images, [distant(direction, np.pi) for direction in directions], names="{:02d}.exr", **{
+        "name": folder.name, "dark": "dark.exr", "camera": camera, **changes})
 
 
 def write_sequence(folder: Path, places: list[float | None], *, cut: int | None = None, noise: float = 0.01,
@@ -84,5 +80,3 @@ def write_sequence(folder: Path, places: list[float | None], *, cut: int | None 
             "schema": "relit.sequence/1", "frames_per_second": 30,
             "steps": [{"path": f"step{step:02d}", "time_s": time} for step, time in enumerate(times)]}))
     return moments
-
-

@@ -21,31 +21,32 @@ BLADE, SLOT = 2e-3, 6e-3
 """Thickness of the blade and width of the slot between two plates, metres."""
 
 
-def _length(p: np.ndarray) -> np.ndarray:
-    return np.sqrt((p * p).sum(axis=-1))
+def capsule(p: np.ndarray, a: tuple, b: tuple, radius: float) -> np.ndarray:
+    start, along = np.array(a), np.array(b) - np.array(a)
+    t = np.clip((p - start) @ along / (along @ along), 0, 1)
+    return np.linalg.norm(p - start - t[..., None] * along, axis=-1) - radius
 
 
-def _capsule(p: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
-    along = np.clip(((p - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
-    return _length(p - a - along[..., None] * (b - a)) - radius
+def ball(p: np.ndarray, centre: tuple, radius: float) -> np.ndarray:
+    return np.linalg.norm(p - np.array(centre), axis=-1) - radius
 
 
-def _box(p: np.ndarray, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    q = np.abs(p - centre) - half
-    return _length(np.maximum(q, 0)) + np.minimum(q.max(axis=-1), 0)
+def box(p: np.ndarray, centre: tuple, half: tuple, round_m: float = 0.0) -> np.ndarray:
+    q = np.abs(p - np.array(centre)) - np.array(half)
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) - round_m
 
 
 PARTS = {
-    "foot": lambda p: _box(p, np.array([0, -0.44, 0]), np.array([0.16, 0.06, 0.16])),
-    "body": lambda p: _capsule(p, np.array([0, -0.38, 0]), np.array([0, 0.12, 0]), 0.11),
-    "head": lambda p: _length(p - np.array([0, 0.34, 0])) - 0.12,
-    "neck": lambda p: _capsule(p, np.array([0, 0.12, 0]), np.array([0, 0.34, 0]), 0.05),
-    "arm": lambda p: _capsule(p, np.array([-0.1, 0.15, 0]), np.array([-0.2, -0.1, 0.2]), 0.03),
-    "shoulder": lambda p: _capsule(p, np.array([0, 0.15, 0]), np.array([0.2, 0.15, 0]), 0.04),
-    "blade": lambda p: _box(p, np.array([0.22, 0.0, 0.0]), np.array([0.06, 0.15, BLADE / 2])),
-    "left plate": lambda p: _box(p, np.array([-0.24, 0.3, -(SLOT / 2 + 0.005)]), np.array([0.06, 0.06, 0.005])),
-    "right plate": lambda p: _box(p, np.array([-0.24, 0.3, SLOT / 2 + 0.005]), np.array([0.06, 0.06, 0.005])),
-    "bracket": lambda p: _capsule(p, np.array([-0.2, 0.3, 0]), np.array([0, 0.3, 0]), 0.012),
+    "foot": lambda p: box(p, (0, -0.44, 0), (0.16, 0.06, 0.16)),
+    "body": lambda p: capsule(p, (0, -0.38, 0), (0, 0.12, 0), 0.11),
+    "head": lambda p: ball(p, (0, 0.34, 0), 0.12),
+    "neck": lambda p: capsule(p, (0, 0.12, 0), (0, 0.34, 0), 0.05),
+    "arm": lambda p: capsule(p, (-0.1, 0.15, 0), (-0.2, -0.1, 0.2), 0.03),
+    "shoulder": lambda p: capsule(p, (0, 0.15, 0), (0.2, 0.15, 0), 0.04),
+    "blade": lambda p: box(p, (0.22, 0.0, 0.0), (0.06, 0.15, BLADE / 2)),
+    "left plate": lambda p: box(p, (-0.24, 0.3, -(SLOT / 2 + 0.005)), (0.06, 0.06, 0.005)),
+    "right plate": lambda p: box(p, (-0.24, 0.3, SLOT / 2 + 0.005), (0.06, 0.06, 0.005)),
+    "bracket": lambda p: capsule(p, (-0.2, 0.3, 0), (0, 0.3, 0), 0.012),
 }
 """Signed distances of the parts, metres; the statue is their union."""
 
@@ -90,16 +91,18 @@ def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float
     return Shot(np.where(mask, true + noise, 0), true, mask, pose, focal, side)
 
 
-def trace(start: np.ndarray, direction: np.ndarray, scene=distance) -> tuple[np.ndarray, np.ndarray]:
-    """How far rays [n, 3] from a point reach, metres, and whether they hit: sphere tracing."""
-    along, alive = np.zeros(len(direction)), np.arange(len(direction))
+def trace(start: np.ndarray, direction: np.ndarray, scene=distance, *, near: float = 0.0, far: float = 10.0, hit_m: float = 1e-7,
+          steps: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """How far rays [n, 3] from a point, or from [n, 3], reach, metres, and whether they hit: sphere tracing."""
+    start = np.broadcast_to(start, direction.shape)
+    along, alive = np.full(len(direction), near), np.arange(len(direction))
     hit = np.zeros(len(direction), dtype=bool)
-    for _ in range(200):
-        d = scene(start + along[alive, None] * direction[alive])
+    for _ in range(steps):
+        d = scene(start[alive] + along[alive, None] * direction[alive])
         along[alive] += d
-        close = np.abs(d) < 1e-7
+        close = np.abs(d) < hit_m
         hit[alive[close]] = True
-        alive = alive[~close & (along[alive] < 10)]
+        alive = alive[~close & (along[alive] < far)]
         if len(alive) == 0:
             break
     return along, hit
@@ -159,14 +162,7 @@ def shoot_parallel(pose: np.ndarray, side: tuple[int, int], pixel_m: float, *, s
     rows, cols = side
     u, v = np.meshgrid(np.arange(cols) + 0.5 - cols / 2, np.arange(rows) + 0.5 - rows / 2)
     points = np.stack([u * pixel_m, -v * pixel_m, np.full(side, start_m)], axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-    along, hit, alive = np.zeros(len(points)), np.zeros(len(points), dtype=bool), np.arange(len(points))
-    for _ in range(200):
-        d = scene(points[alive] - along[alive, None] * pose[:3, 2])
-        along[alive] += d
-        hit[alive[np.abs(d) < 1e-7]] = True
-        alive = alive[(np.abs(d) >= 1e-7) & (along[alive] < start_m + 5)]
-        if len(alive) == 0:
-            break
+    along, hit = trace(points, np.broadcast_to(-pose[:3, 2], points.shape), scene, far=start_m + 5)
     mask = hit.reshape(side)
     true = np.where(mask, along.reshape(side) - start_m, 0)
     noise = sigma * np.random.default_rng(seed).standard_normal(side)

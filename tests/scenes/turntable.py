@@ -8,6 +8,7 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.transforms import rotation_about_y
+from tests.scenes.statue import ball, box, capsule, trace
 
 MM = 1e-3
 DISTANCE_M = 2.0
@@ -28,21 +29,6 @@ class View(NamedTuple):
     sigma: np.ndarray  # [rows, cols] float32 metres, true
     world_from_scan: np.ndarray  # [4, 4]
     true_depth: np.ndarray  # [rows, cols] without noise
-
-
-def capsule(p: np.ndarray, a: tuple, b: tuple, radius: float) -> np.ndarray:
-    start, along = np.array(a), np.array(b) - np.array(a)
-    t = np.clip((p - start) @ along / (along @ along), 0, 1)
-    return np.linalg.norm(p - start - t[:, None] * along, axis=1) - radius
-
-
-def ball(p: np.ndarray, centre: tuple, radius: float) -> np.ndarray:
-    return np.linalg.norm(p - np.array(centre), axis=1) - radius
-
-
-def box(p: np.ndarray, centre: tuple, half: tuple, round_m: float) -> np.ndarray:
-    q = np.abs(p - np.array(centre)) - np.array(half)
-    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0) - round_m
 
 
 def joined(parts: list[np.ndarray], soft: float) -> np.ndarray:
@@ -122,18 +108,7 @@ def _march(surface: Distance, pose_rows: tuple, rows: int) -> tuple[np.ndarray, 
     ray = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
     length = np.linalg.norm(ray, axis=1)
     direction = (ray / length[:, None]) @ world_from_scan[:3, :3].T
-    start = world_from_scan[:3, 3]
-    along = np.full(len(ray), DISTANCE_M - 0.75)
-    active = np.arange(len(ray))
-    hit = np.zeros(len(ray), dtype=bool)
-    for _ in range(STEPS):
-        distance = surface(start + along[active, None] * direction[active])
-        along[active] += distance
-        there = np.abs(distance) < HIT_M
-        hit[active[there]] = True
-        active = active[~there & (along[active] < DISTANCE_M + 0.75)]
-        if active.size == 0:
-            break
+    along, hit = trace(world_from_scan[:3, 3], direction, surface, near=DISTANCE_M - 0.75, far=DISTANCE_M + 0.75, hit_m=HIT_M, steps=STEPS)
     shape = camera.height, camera.width
     return np.where(hit, along / length, 0).reshape(shape), hit.reshape(shape)
 

@@ -51,6 +51,16 @@ class JsonLog:
         return self._lines
 
 
+def new_key(database: Database, project: str = "larch", scope: Scope = Scope.ADMIN, **more: float) -> str:
+    """Make a key."""
+    return database.transact(partial(keys.insert, wanted=NewKey(project=project, name="test", scope=scope, **more)))
+
+
+def revoke(database: Database, key: str) -> bool:
+    """Revoke a key, if it is not revoked yet."""
+    return database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
+
+
 class Server:
     """A server that runs."""
 
@@ -70,7 +80,7 @@ class Server:
     def key(self, project: str = "larch", scope: Scope = Scope.ADMIN) -> str:
         """Make a key."""
         with self.database() as database:
-            return database.transact(partial(keys.insert, wanted=NewKey(project=project, name="test", scope=scope)))
+            return new_key(database, project, scope)
 
     def client(self, key: str | None = None) -> httpx2.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}

@@ -1,8 +1,5 @@
 """Scenes and stages that are captured in tests."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -12,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-import service
 from service.acquisition.checks.expectation import Fault, FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
@@ -25,6 +21,7 @@ from tests.scenes.patched_rigs import loopback
 from tests.scenes.rigs import write_rig
 from tests.service.acquisition.test_acquire import posting
 from tests.service.owl import OWL, block_mean
+from tests.service.twin_program import twin_running
 
 KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
          FaultKind.UNSHARP)
@@ -33,7 +30,6 @@ VISIBLE = 0.3
 
 BRIGHT = 1.5
 """Ambient light of 0.8 of the mean picture goes where a lamp gives less than this: the prediction errs by more beside the brightest."""
-ROOT = Path(service.__file__).parents[1]
 
 
 class Scene(NamedTuple):
@@ -164,13 +160,6 @@ def owl_on_stage(folder: Path, *options: object) -> Iterator[list[object]]:
     """
     rig, watched, host = folder / "rig.json", folder / "watched", loopback()
     write_rig(rig, [frame.light.direction for frame in Capture.open(OWL).manifest.frames], {"white": (1.0, 1.0, 1.0)}, host=host)
-    command = [sys.executable, "-m", "service.cli.main", "twin", rig, OWL, "--interface", host, "--port", "0", "--pictures", watched,
-               "--noise", "0.001", "--exposure", "-2", "--cache", folder, *options]
-    twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    try:
-        assert twin.stdout.readline().startswith("twin ")
-        page = twin.stdout.readline().split()[1].removesuffix(":")
+    with twin_running(rig, OWL, host, "--pictures", watched, "--noise", "0.001", "--exposure", "-2", "--cache", folder,
+                      *options) as (_, page):
         yield ["--rig", rig, "--camera", f"watch:{watched}", "--trigger", posting(f"{page}/release")]
-    finally:
-        twin.kill()
-        twin.wait()

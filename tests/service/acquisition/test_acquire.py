@@ -18,7 +18,6 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-import service
 from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
@@ -29,11 +28,12 @@ from stage.capture.capture import Capture
 from stage.errors import StageError
 from stage.importers.camera_options import View
 from tests.scenes.captures import make_scene, rgb, write_exr
+from tests.scenes.patched_rigs import write_plan
 from tests.service.answering import Asked, answering
 from tests.service.full_disk import files_of_at_most
+from tests.service.twin_program import ROOT
 from tests.service.waiting import until
 
-ROOT = Path(service.__file__).parents[1]
 LAMPS = 6
 
 
@@ -84,11 +84,10 @@ def write_rig(path: Path, stage: Stage, protocol: str, controllers: dict | None 
 
 
 def request(folder: Path, stage: Stage, rig: Path, **changes) -> AcquireRequest:
-    plan = folder / "plan.json"
-    if not plan.exists():
-        plan.write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}))
-    return AcquireRequest(**{"plan": str(plan), "rig": rig, "camera": f"watch:{stage.folder}", "out": folder / "capture", "timeout": 0.3,
-                             **changes})
+    if not (folder / "plan.json").exists():
+        write_plan(folder, {"take": "dark"}, {"take": "olat"})
+    return AcquireRequest(**{"plan": str(folder / "plan.json"), "rig": rig, "camera": f"watch:{stage.folder}",
+                             "out": folder / "capture", "timeout": 0.3, **changes})
 
 
 def by_hand(folder: Path, stage: Stage) -> tuple[Path, object]:
@@ -317,8 +316,7 @@ def be_the_program(words: list[str], said: Path) -> None:
 @pytest.mark.long
 def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
     stage, rounds, most = Stage(tmp_path / "watch"), 5, 3
-    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, *[{"take": "olat"}] * rounds]}
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    write_plan(tmp_path, {"take": "dark"}, *[{"take": "olat"}] * rounds)
     with controller(tmp_path, stage) as (rig, url):
         given = request(tmp_path, stage, rig, trigger=posting(f"{url}/shoot"), timeout=10)
         words = ["capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out", str(given.out), "--trigger", given.trigger,

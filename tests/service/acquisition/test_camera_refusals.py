@@ -139,6 +139,15 @@ def test_a_raw_file_over_the_cable_is_read_as_light(setup, reflex, tmp_path, mon
     assert picture.pixels.shape == (40, 60, 3) and np.allclose(picture.pixels, 0.5, atol=1e-3)  # (7756 - 512) / (15000 - 512)
 
 
+def test_a_preview_over_the_cable_is_a_picture(setup, reflex):
+    file = reflex.package.CameraFile()
+    file.set_data_and_size(cv2.imencode(".jpg", np.full((24, 32, 3), (50, 100, 200), np.uint8))[1].tobytes())
+    reflex.capture_preview = lambda self: file
+    pixels = open_camera("gphoto2", setup).look()
+    assert pixels.shape == (24, 32, 3) and pixels.dtype == np.float32
+    assert 255 * pixels.mean(axis=(0, 1)) == pytest.approx([200, 100, 50], abs=4)  # JPEG; OpenCV's order is blue first
+
+
 class Machine:
     """Stands in for the library Aravis: features with their values, of which some cannot be set, and whether the camera is lost."""
 

@@ -26,6 +26,7 @@ from stage.results.maps import SurfaceMaps
 from tests.reference.balls import render as render_ball
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr, write_image
 from tests.scenes.ellipsoid import ellipsoid
+from tests.scenes.video import write_video
 from tests.service.acquisition.test_acquire import write_rig
 from tests.service.calibrate.test_ball_finder import chrome
 from tests.service.solve.lights.test_unknown_lights import shiny
@@ -82,16 +83,12 @@ def test_exposure_times_as_cameras_write_them(text, seconds):
     assert seconds_of(text) == (None if seconds is None else pytest.approx(seconds))
 
 
-def write_video(path, levels):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-    for level in levels:
-        writer.write(np.full((48, 64, 3), level, np.uint8))
-    writer.release()
-    return path
+def grey_video(path, levels):
+    return write_video(path, [np.full((48, 64, 3), level, np.uint8) for level in levels])
 
 
 def test_a_video_gives_its_frames_in_order_and_ends(tmp_path):
-    path = write_video(tmp_path / "video.avi", (40, 200))
+    path = grey_video(tmp_path / "video.avi", (40, 200))
     camera = open_camera(f"video:{path}", Setup(tmp_path / "spool", 1.0, (), None))
     means = [255 * float(camera.take(None).pixels.mean()) for _ in range(2)]
     assert means == pytest.approx([40, 200], abs=4)  # JPEG
@@ -104,7 +101,7 @@ def test_a_video_gives_its_frames_in_order_and_ends(tmp_path):
 
 def test_a_video_device_gives_no_frame_that_was_taken_before_the_release(tmp_path, monkeypatch):
     """A device by its number, behind which a file is opened: a device keeps four frames, which the lamps before have lit."""
-    path, opened = write_video(tmp_path / "video.avi", range(0, 200, 20)), cv2.VideoCapture
+    path, opened = grey_video(tmp_path / "video.avi", range(0, 200, 20)), cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda number: opened(str(path)))
     camera = open_camera("video:0", Setup(tmp_path / "spool", 1.0, (), None))
     assert [255 * float(camera.take(None).pixels.mean()) for _ in range(2)] == pytest.approx([80, 180], abs=4)  # JPEG

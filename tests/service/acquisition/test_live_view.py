@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire
-from service.acquisition.cameras.camera import Setup, open_camera
 from service.acquisition.live_view import LiveView
 from service.acquisition.remote_control import RemoteControl
 from service.errors import RequestError
@@ -23,6 +22,7 @@ from stage.formats import images
 from stage.transforms import rotation_about
 from tests.scenes.captures import angles_degrees, write_exr
 from tests.scenes.chart import CAMERA, Pose, picture, reflectances, shoot
+from tests.scenes.video import write_video
 from tests.service.acquisition.test_acquire import LAMPS, Stage, controller, write_rig
 from tests.service.acquisition.test_cameras import virtual_camera
 from tests.service.calibrate.test_ball_finder import DIRECTIONS, chrome, photograph
@@ -36,11 +36,7 @@ def video(path: Path, *, blur_px: float, frames: int = 3) -> Path:
     frame = np.random.default_rng(3).integers(40, 160, (200, 240), dtype=np.uint8)
     frame = cv2.GaussianBlur(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR), (0, 0), blur_px)
     frame[100:, 120:] = 255
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (240, 200))
-    for _ in range(frames):
-        writer.write(frame)
-    writer.release()
-    return path
+    return write_video(path, [frame] * frames)
 
 
 @pytest.mark.long
@@ -96,32 +92,6 @@ def test_the_meter_shows_the_live_view_on_a_page_before(tmp_path):
 def test_a_camera_without_a_live_view_is_refused(tmp_path):
     with pytest.raises(RequestError, match="no live view"):
         LiveView(tmp_path / "rig.json", f"watch:{tmp_path}", tmp_path / "live")
-
-
-def test_a_picture_of_a_camera_that_has_one(tmp_path, monkeypatch):
-    """A stand-in for a camera at a USB port: the package itself makes and saves its file."""
-    gp = pytest.importorskip("gphoto2")
-
-    class Camera:
-        autodetect = staticmethod(lambda: type("Found", (), {"count": lambda self: 0})())
-
-        def init(self) -> None:
-            """Do nothing."""
-
-        exit = init
-
-        def get_single_config(self, name: str) -> None:
-            raise gp.GPhoto2Error(gp.GP_ERROR_NOT_SUPPORTED)
-
-        def capture_preview(self):
-            file = gp.CameraFile()
-            file.set_data_and_size(cv2.imencode(".jpg", np.full((24, 32, 3), (50, 100, 200), np.uint8))[1].tobytes())
-            return file
-
-    monkeypatch.setattr(gp, "Camera", Camera)
-    pixels = open_camera("gphoto2", Setup(tmp_path / "spool", 1.0, (), None)).look()
-    assert pixels.shape == (24, 32, 3) and pixels.dtype == np.float32
-    assert 255 * pixels.mean(axis=(0, 1)) == pytest.approx([200, 100, 50], abs=4)  # JPEG; OpenCV's order is blue first
 
 
 @pytest.mark.long

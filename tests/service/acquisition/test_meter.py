@@ -16,28 +16,24 @@ from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.formats import images
 from tests.scenes.captures import make_scene, write_exr
-from tests.service.acquisition.test_acquire import LAMPS, controller
+from tests.scenes.patched_rigs import write_plan
+from tests.service.acquisition.test_acquire import LAMPS, Stage, controller
 from tests.service.acquisition.test_cameras import virtual_camera
 
 LEVEL_STEP = 2 ** (1 / 3)
 
 
-class MeteredStage:
+class MeteredStage(Stage):
     """Lamps on a textured cap, the fifth twice as bright, and a camera whose exposure time is set; noise is a thousandth of full scale."""
 
     def __init__(self, folder) -> None:
-        self.scene, self.folder, self.exposure, self.blur_px = make_scene(size=96, lights=LAMPS), folder, None, 0.0
-        self.random, self.released, self.on = np.random.default_rng(4), 0, set()
+        super().__init__(folder)
+        self.scene, self.random, self.exposure, self.blur_px = make_scene(size=96, lights=LAMPS), np.random.default_rng(4), None, 0.0
         texture = 1 + 0.3 * self.random.uniform(-1, 1, self.scene.mask.shape)
         self.radiance = 0.9 * self.scene.images * texture[None, ..., None]
         self.radiance[4] *= 2
-        folder.mkdir()
 
-    def command(self, text: str) -> None:
-        word, *rest = text.split()
-        self.on = set() if word == "off" else self.on | {int(rest[0])}
-
-    def release(self, exposure: float | None) -> None:
+    def release(self, exposure: float | None = None) -> None:
         self.released, self.exposure = self.released + 1, exposure
         pixels = (exposure or 1.0) * sum((self.radiance[lamp] for lamp in self.on), np.zeros_like(self.radiance[0]))
         pixels = ndimage.gaussian_filter(pixels, (self.blur_px, self.blur_px, 0))
@@ -60,8 +56,7 @@ def stage(tmp_path, monkeypatch):
 
 def request(folder, stage, rig, exposure: float | None = None) -> AcquireRequest:
     sequence = {"take": "olat"} if exposure is None else {"take": "olat", "exposures_s": [exposure]}
-    (folder / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [sequence]}))
-    return AcquireRequest(plan=str(folder / "plan.json"), rig=rig, camera=f"watch:{stage.folder}", out=folder / "meter", timeout=5,
+    return AcquireRequest(plan=str(write_plan(folder, sequence)), rig=rig, camera=f"watch:{stage.folder}", out=folder / "meter", timeout=5,
                           trigger="shoot {exposure_s}", preview=True)
 
 

@@ -1,9 +1,7 @@
 """A performance, frames under lights that repeat a plan: cut into a sequence, solved aligned, and relit; and what does not fit is named."""
 
-import json
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,8 +9,11 @@ from stage.capture.manifest import read_manifest
 from stage.capture.sequence import read_sequence
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
-from tests.scenes.captures import angles_degrees, files_in, ring, write_exr, write_image
+from tests.scenes.captures import angles_degrees, files_in, rgb, ring, write_exr, write_image
 from tests.scenes.moving import RADIUS, Subject
+from tests.scenes.patched_rigs import write_plan
+from tests.scenes.rigs import write_rig
+from tests.scenes.video import write_video
 
 LAMPS, EVERY, PERIOD, STEPS = 8, 4, 10, 4
 """A period is T LLLL T LLLL, and a tracking frame closes the last."""
@@ -23,20 +24,9 @@ STILL = Subject()
 ORDER = ["full", 0, 1, 2, 3, "full", 4, 5, 6, 7]
 
 
-def plan(folder, **changes):
-    path = folder / "plan.json"
-    path.write_text(json.dumps({"schema": "relit.plan/1", "tracking_every": EVERY, "sequences": [{"take": "olat"}], **changes}))
-    return path
-
-
 def rig(folder, lamps=LAMPS):
-    path = folder / "rig.json"
-    path.write_text(json.dumps({"schema": "relit.rig/1", "name": "arc", "color_space": "lin_rec709_scene", "lights": [
-        {"name": f"L{index}", "type": "distant", "direction": direction.tolist(),
-         "primaries": [{"name": "white", "irradiance": [np.pi] * 3}],
-         "address": {"protocol": "sacn", "universe": 1, "channels": {"white": index + 1}}}
-        for index, direction in enumerate(ring(lamps))]}))
-    return path
+    write_rig(folder / "rig.json", ring(lamps), {"white": (np.pi,) * 3})
+    return folder / "rig.json"
 
 
 def frame(subject, time, light):
@@ -59,9 +49,11 @@ def shoot(folder, subject, *, count=PERIOD * STEPS + 1, noise=NOISE, first=0, or
     return folder
 
 
-def imported(relit, source, target, *options):
+def imported(relit, source, target, *options, sequences=({"take": "olat"},), tracking_every=EVERY, lamps=LAMPS):
+    """Run the import with the plan of these sequences beside the target."""
     folder = target.parent
-    return relit("import", "interleaved", source, target, "--period", plan(folder), "--rig", rig(folder), *options)
+    period = write_plan(folder, *sequences, tracking_every=tracking_every)
+    return relit("import", "interleaved", source, target, "--period", period, "--rig", rig(folder, lamps), *options)
 
 
 @pytest.fixture(scope="module")
@@ -123,12 +115,9 @@ def test_what_is_at_rest_does_not_flicker_when_relit(relit, tmp_path):
 
 def test_a_video_is_cut_into_steps(relit, tmp_path):
     source = shoot(tmp_path / "frames", GLIDING._replace(size=48), noise=0)
-    writer = cv2.VideoWriter(str(tmp_path / "take.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 120, (48, 48))
-    for number in range(PERIOD * STEPS + 1):
-        layers, _ = exr.read(source / f"take_{number}.exr")
-        image = np.stack([layers[channel] for channel in "BGR"], axis=-1)
-        writer.write(np.rint(255 * np.clip(image / 4, 0, 1) ** (1 / 2.2)).astype(np.uint8))
-    writer.release()
+    frames = (rgb(source / f"take_{number}.exr")[..., ::-1] for number in range(PERIOD * STEPS + 1))
+    write_video(tmp_path / "take.avi", (np.rint(255 * np.clip(frame / 4, 0, 1) ** (1 / 2.2)).astype(np.uint8) for frame in frames),
+                codec="FFV1", rate=120)
     out = imported(relit, tmp_path / "take.avi", tmp_path / "walk").well()
     assert "41 of its frames" in out or "41 of 41 frames" in out
     sequence = read_sequence(tmp_path / "walk")
@@ -183,9 +172,8 @@ def test_of_a_subject_that_hardly_moves_the_very_frame_is_named(relit, tmp_path,
     """Without tracking frames too."""
     shoot(tmp_path / "frames", Subject(size=48, shift_px=(0.02, 0.0)), noise=0.002, order=["off", "off", *range(LAMPS)])
     renumbered(tmp_path / "frames", keep)
-    period = plan(tmp_path, tracking_every=None, sequences=[{"take": "dark", "count": 2}, {"take": "olat"}])
-    relit("import", "interleaved", tmp_path / "frames", tmp_path / "walk", "--period", period, "--rig", rig(tmp_path), "--frames",
-          "0-39").refused(words)
+    imported(relit, tmp_path / "frames", tmp_path / "walk", "--frames", "0-39", tracking_every=None,
+             sequences=[{"take": "dark", "count": 2}, {"take": "olat"}]).refused(words)
 
 
 @pytest.mark.parametrize("lamps", [9, 7])
@@ -193,8 +181,7 @@ def test_another_period_than_that_of_the_frames_is_named(relit, tmp_path, glidin
     """Frames that happen to be as many as whole periods of a plan with another number of lamps."""
     shutil.copytree(gliding, tmp_path / "frames")
     renumbered(tmp_path / "frames", EACH[:3 * (lamps + {9: 3, 7: 2}[lamps]) + 1])
-    outcome = relit("import", "interleaved", tmp_path / "frames", tmp_path / "walk", "--period", plan(tmp_path), "--rig",
-                    rig(tmp_path, lamps))
+    outcome = imported(relit, tmp_path / "frames", tmp_path / "walk", lamps=lamps)
     assert outcome.code == 2 and ("10 frames before it" in outcome.err or "should be a tracking frame" in outcome.err), outcome
     assert not (tmp_path / "walk").exists()
 
@@ -206,8 +193,7 @@ def test_plans_that_cannot_repeat_and_folders_that_are_there_are_refused(relit, 
     run("polarised").refused("waits for a person")
     run("olat", target=None).refused("DST is missing")
     run("gray").refused("give the pixels of the projector")
-    flat = plan(tmp_path, sequences=[{"take": "olat"}, {"take": "flat"}])
-    run(flat).refused("flat is an image of something else")
+    run(write_plan(tmp_path, {"take": "olat"}, {"take": "flat"})).refused("flat is an image of something else")
     run("olat", "--frames", "0-90").refused("has 41 frames, 0 to 40, and --frames asks for 0-90")
     run("olat", "--frames", "all").refused("--frames all: give first, last and step")
     (tmp_path / "walk").mkdir()
@@ -219,16 +205,15 @@ def test_plans_that_cannot_repeat_and_folders_that_are_there_are_refused(relit, 
 
 def test_gradients_dark_and_patterns_are_frames_of_a_period(relit, tmp_path):
     """Without tracking frames nothing closes a period."""
-    period = plan(tmp_path, tracking_every=None, sequences=[{"take": "dark"}, {"take": "gradients"}, {"take": "patterns", "code": "phase"}])
+    def run(frames):
+        return imported(relit, tmp_path / "frames", tmp_path / "walk", "--projector", "64x32", "--frames", frames, tracking_every=None,
+                        sequences=[{"take": "dark"}, {"take": "gradients"}, {"take": "patterns", "code": "phase"}])
+
     random = np.random.default_rng(0)
-    count = 1
     for count in range(1, 60):  # the number of images of the code with its default options is that of relit patterns
         write_exr(tmp_path / "frames" / f"{count}.exr", random.uniform(0.1, 1, (32, 32, 3)))
-    out = relit("import", "interleaved", tmp_path / "frames", tmp_path / "walk", "--period", period, "--rig", rig(tmp_path),
-                "--projector", "64x32", "--frames", "0-0").refused("has 1 frames, and a period of")
-    length = int(out.split("has ")[-1].split()[0])
-    relit("import", "interleaved", tmp_path / "frames", tmp_path / "walk", "--period", period, "--rig", rig(tmp_path), "--projector",
-          "64x32", "--frames", f"0-{length - 1}").well()
+    length = int(run("0-0").refused("has 1 frames, and a period of").split("has ")[-1].split()[0])
+    run(f"0-{length - 1}").well()
     manifest = read_manifest(tmp_path / "walk" / "0001" / "capture.json")
     kinds = [frame.light.type if frame.light else frame.pattern.code for frame in manifest.frames]
     assert kinds[:8] == ["off", *["gradient"] * 7] and len(kinds) == length and "phase" in kinds[8:]

@@ -17,6 +17,7 @@ from stage.capture.capture import Capture
 from stage.formats import images
 from stage.patterns.codes import draw
 from tests.scenes.captures import write_exr
+from tests.scenes.patched_rigs import write_plan
 
 SIZE, AMBIENT = (64, 48), 0.03
 ALBEDO = np.random.default_rng(1).uniform(0.3, 0.8, (SIZE[1], SIZE[0], 1))
@@ -128,11 +129,10 @@ def test_a_capture_goes_on_with_the_response_that_it_measured(tmp_path, scene):
 @pytest.mark.long
 def test_white_pictures_between_patterns_show_what_moved_and_what_was_taken_is_shown_again(tmp_path, scene, monkeypatch):
     """The decoded capture has the patterns alone."""
-    (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "tracking_every": 5, "sequences": [
-        {"take": "patterns", "code": "phase"}]}))
+    plan = write_plan(tmp_path, {"take": "patterns", "code": "phase"}, tracking_every=5)
 
     def run(**changes):
-        return acquire(request(tmp_path, str(tmp_path / "plan.json"), **changes), refuse_to_ask, scene.tell)
+        return acquire(request(tmp_path, str(plan), **changes), refuse_to_ask, scene.tell)
 
     still = run(out=tmp_path / "still")
     frames = Capture.open(tmp_path / "still").manifest.frames

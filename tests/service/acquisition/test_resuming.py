@@ -22,6 +22,7 @@ from stage.results.maps import SurfaceMaps
 from stage.stack.early import EarlyStack
 from stage.stack.ingest import Ingest
 from tests.scenes.captures import angles_degrees, make_scene, render, write_capture, write_image
+from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, by_hand, check, controller, request
 from tests.service.full_disk import files_of_at_most
 
@@ -96,8 +97,7 @@ def test_other_settings_are_named_with_both_values_and_the_same_go_on(tmp_path, 
 def test_a_shutter_speed_that_the_plan_sets_is_no_difference(tmp_path, program, monkeypatch):
     take = WatchedFolder.take
     monkeypatch.setattr(WatchedFolder, "take", lambda camera, exposure: take(camera, None))
-    plan = tmp_path / "plan.json"
-    plan.write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat", "exposures_s": [0.1]}]}))
+    write_plan(tmp_path, {"take": "olat", "exposures_s": [0.1]})
     program.settings = {"shutterspeed": "1/60", "iso": "100"}
     with controller(tmp_path, program.stage) as (rig, _):
         begin(tmp_path, program, rig)
@@ -195,9 +195,8 @@ def test_the_preview_shows_the_normals_of_the_capture(tmp_path):
 
 
 def arguments(folder, stage, rig) -> list:
-    (folder / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat"}]}))
-    words = ["capture", folder / "plan.json", "--rig", rig, "--camera", f"watch:{stage.folder}", "--out", folder / "capture"]
-    return [*words, "--trigger", "x"]
+    return ["capture", write_plan(folder, {"take": "olat"}), "--rig", rig, "--camera", f"watch:{stage.folder}", "--out", folder / "capture",
+            "--trigger", "x"]
 
 
 def test_a_capture_is_solved_and_exported(tmp_path, stage, relit):
@@ -277,8 +276,7 @@ def test_brackets_are_taken_merged_and_solved(tmp_path, monkeypatch, relit):
     monkeypatch.setattr(WatchedFolder, "_release", release)
     rig, ask = by_hand(tmp_path, stage)
     for name, exposures in (("both", [0.004, 0.03]), ("short", [0.004]), ("clean", [0.02])):
-        plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat", "exposures_s": exposures}]}
-        (tmp_path / "plan.json").write_text(json.dumps(plan))
+        write_plan(tmp_path, {"take": "olat", "exposures_s": exposures})
         result = acquire(request(tmp_path, stage, rig, out=tmp_path / name, color_space="lin_rec709_scene",
                                  trigger="shoot {exposure_s}"), ask)
         assert (result.faults, result.retaken, result.there) == ((), (), LAMPS * len(exposures))

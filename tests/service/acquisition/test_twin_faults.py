@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from tests.service.acquisition.scenes import ROOT
 from tests.service.acquisition.twin_in_process import TwinInProcess, named, wanted
+from tests.service.twin_program import ROOT
 
 CROP = "130,120,48,48"
 """The part of the owl that is solved."""

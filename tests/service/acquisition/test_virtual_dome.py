@@ -1,7 +1,4 @@
-"""Captures at virtual domes, one of them by a watched folder.
-
-The card is full after 26 pictures, so the capture goes on several times.
-"""
+"""Captures at virtual domes by a virtual camera, whose card is full after 26 pictures, so that a capture goes on several times."""
 
 import json
 import signal
@@ -25,12 +22,12 @@ from stage.formats import images
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
-from tests.scenes.captures import make_scene, render, write_capture, write_exr
-from tests.scenes.patched_rigs import loopback
+from tests.scenes.captures import Scene, make_scene, render, write_capture, write_exr
+from tests.scenes.patched_rigs import loopback, write_plan
 from tests.scenes.rigs import write_rig
-from tests.service.acquisition.scenes import BRIGHT, ROOT, VISIBLE, owl_on_stage, relief
+from tests.service.acquisition.scenes import BRIGHT, VISIBLE, relief
 from tests.service.acquisition.test_cameras import virtual_camera
-from tests.service.owl import OWL, block_mean
+from tests.service.twin_program import ROOT, twin_running
 from tests.service.waiting import until
 
 LAMPS = 96
@@ -84,8 +81,6 @@ with Listener(twin.universes, host, keep=False) as listener:
                     raise  # the next camera has an empty one
 print(json.dumps([cards, {fault.shot: fault.kind for fault in result.faults}]))
 """
-CROP = "130,120,48,48"
-"""The part of the owl that is solved."""
 
 
 def photographed(folder: Path, host: str, *faults: str) -> list:
@@ -99,6 +94,13 @@ def photographed(folder: Path, host: str, *faults: str) -> list:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def shown_lamps(scene: Scene, capture: Path) -> list[int]:
+    """Return the lamp of the scene whose light each picture of a capture is nearest to."""
+    codes = np.array([images.read_pixels(capture / frame.image) for frame in Capture.open(capture).manifest.frames], dtype=np.float64)
+    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    return [int(np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin()) for each in seen]
+
+
 @pytest.mark.long
 def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
     """Each picture is that of its lamp, and what is solved of them is what is solved of the same files when they are imported."""
@@ -107,8 +109,7 @@ def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
     scene = scene._replace(directions=directions, irradiance=light, images=render(scene.normal, scene.albedo, directions, light))
     write_capture(tmp_path / "scene", scene)
     write_rig(tmp_path / "rig.json", directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()))
-    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat"}]}
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    write_plan(tmp_path, {"take": "olat"})
     (tmp_path / "card").mkdir()
     cards, faults = photographed(tmp_path, host)
     assert cards >= 2 and faults == {}
@@ -116,9 +117,7 @@ def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
     frames = json.loads((capture / "capture.json").read_text())["frames"]
     towards = np.array([frame["light"]["direction"] for frame in frames])
     assert np.array_equal((towards @ directions.T).argmax(axis=1), np.arange(LAMPS))
-    codes = np.array([images.read_pixels(capture / frame["image"]) for frame in frames], dtype=np.float64)
-    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    assert np.array_equal([np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen], np.arange(LAMPS))
+    assert shown_lamps(scene, capture) == list(range(LAMPS))
     rows = [" ".join([frame["image"], *map(repr, frame["light"]["direction"])]) for frame in frames]
     (capture / "dome.lp").write_text("\n".join([str(LAMPS), *rows]))
     relit.done("import", "lp", capture / "dome.lp", imported, "--color-space", "srgb_texture")
@@ -140,8 +139,7 @@ def test_faults_on_the_card_are_named_with_their_pictures_and_none_else(tmp_path
                                      mask=np.ones(scene.radiance.shape[1:3], bool))
     write_capture(tmp_path / "scene", pictures)
     write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()), protocol=protocol)
-    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    write_plan(tmp_path, {"take": "dark"}, {"take": "olat"})
     (tmp_path / "card").mkdir()
     made: dict[int, str] = {}
     for fault in FAULTS:
@@ -192,22 +190,12 @@ def test_the_commands_take_the_pictures_of_a_virtual_camera(tmp_path):
     scene = scene._replace(irradiance=light, images=render(scene.normal, scene.albedo, scene.directions, light))
     write_capture(tmp_path / "scene", scene)
     write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=host)
-    (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0.5, "sequences": [{"take": "olat"}]}))
-    program = [sys.executable, "-m", "service.cli.main"]
-    twin = subprocess.Popen([*program, "twin", tmp_path / "rig.json", tmp_path / "scene", "--interface", host, "--port", "0", "--pictures",
-                             card, "--picture-format", "card", "--cache", tmp_path], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    try:
-        assert twin.stdout.readline().startswith("twin ")
+    plan = write_plan(tmp_path, {"take": "olat"}, settle_s=0.5)
+    with twin_running(tmp_path / "rig.json", tmp_path / "scene", host, "--pictures", card, "--picture-format", "card", "--cache", tmp_path):
         until(lambda: any(card.glob("*")), "the card has no picture")
-        subprocess.run([*program, "capture", tmp_path / "plan.json", "--rig", tmp_path / "rig.json", "--camera", "gphoto2", "--out",
-                        tmp_path / "capture", "--retakes", "20"], check=True, cwd=ROOT, env=virtual_camera(card))
-    finally:
-        twin.kill()
-        twin.wait()
-    pictures = [tmp_path / "capture" / frame.image for frame in Capture.open(tmp_path / "capture").manifest.frames]
-    codes = np.array([images.read_pixels(path) for path in pictures], dtype=np.float64)
-    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    assert [np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(lamps))
+        subprocess.run([sys.executable, "-m", "service.cli.main", "capture", plan, "--rig", tmp_path / "rig.json", "--camera", "gphoto2",
+                        "--out", tmp_path / "capture", "--retakes", "20"], check=True, cwd=ROOT, env=virtual_camera(card))
+    assert shown_lamps(scene, tmp_path / "capture") == list(range(lamps))
 
 
 def test_a_card_cannot_lose_a_picture(tmp_path, relit):
@@ -217,30 +205,3 @@ def test_a_card_cannot_lose_a_picture(tmp_path, relit):
     words = relit.refused("twin", tmp_path / "rig.json", tmp_path / "scene", "--pictures", tmp_path / "card", "--picture-format", "card",
                           "--faults", "dead@3,late@4")
     assert "--faults late" in words
-
-
-@pytest.mark.long
-def test_the_owl_is_captured_as_its_files_are_imported(tmp_path, relit):
-    """Each of 96 pictures is that of its lamp, and what is solved of them is what is solved of the same files when they are imported."""
-    with owl_on_stage(tmp_path) as given:
-        said = relit.done("capture", "olat", *given, "--out", tmp_path / "capture").out
-    assert "fault " not in said and "96 of 96" in said
-    capture, imported = tmp_path / "capture", tmp_path / "imported"
-    frames, lights = (Capture.open(folder).manifest.frames for folder in (capture, OWL))
-    assert np.allclose([frame.light.direction for frame in frames], [frame.light.direction for frame in lights], atol=1e-6)
-    seen, lit = (np.stack([block_mean(images.read_pixels(path).astype(np.float32), 8) for path in paths])
-                 for paths in ([capture / frame.image for frame in frames], sorted(OWL.glob("[0-9][0-9][0-9].exr"))))
-    # the owl's lamps are three times as bright, and the exposure is a quarter
-    assert [np.abs(lit / 12 - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(96))
-
-    rows = [" ".join([frame.image, *map(repr, frame.light.direction)]) for frame in frames]
-    (capture / "dome.lp").write_text("\n".join([str(len(rows)), *rows]))
-    relit.done("import", "lp", capture / "dome.lp", imported)
-    for folder in (capture, imported):
-        relit.done("solve", folder, "--method", "robust", "--crop", CROP, "--out", folder / "maps")
-    relit.done("export", capture / "maps", "--out", capture / "asset.usdz")
-    maps = [OpenEXR.File(str(folder / "maps" / "maps.exr"), separate_channels=True).channels() for folder in (capture, imported)]
-    assert maps[0].keys() == maps[1].keys()
-    for name, channel in maps[0].items():
-        assert np.array_equal(channel.pixels, maps[1][name].pixels, equal_nan=True), name
-    assert (capture / "asset.usdz").stat().st_size > 0

@@ -1,6 +1,5 @@
 """The shipped owl on the twin of a stage with 96 lamps, in the process of a test, and its faults."""
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from service.requests.play import PictureFault, TwinRequest
 from service.twin.camera import TwinCamera
 from service.twin.twin import open_twin
 from stage.capture.capture import Capture
+from tests.scenes.patched_rigs import write_plan
 from tests.scenes.rigs import write_rig
 from tests.service.acquisition.scenes import BRIGHT
 from tests.service.owl import OWL
@@ -58,8 +58,7 @@ class TwinInProcess:
         folder.mkdir()
         camera = TwinCamera(self._twin.rig, SimpleNamespace(radiance=self.radiance, space=self._twin.picture.space), None, folder,
                             self._request.model_copy(update={"seed": seed}))
-        plan = self._folder / "plan.json"
-        plan.write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}))
+        plan = write_plan(self._folder, {"take": "dark"}, {"take": "olat"})
 
         def release(_: WatchedFolder, exposure_s: float | None) -> None:
             lit = np.flatnonzero(self.levels)

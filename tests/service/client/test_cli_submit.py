@@ -32,15 +32,6 @@ def said(out: str) -> dict[str, str]:
 
 
 @pytest.mark.long
-def test_a_folder_becomes_maps(relit, tmp_path: Path):
-    found = said(relit("submit", "solve", write_capture(tmp_path / "ball"), "--method", "lambert", "--out", tmp_path / "out").well())
-    assert found["state"].startswith("succeeded, ")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"maps.exr", "report.json"}
-    shown = said(relit("jobs", "show", found["job"]).well())
-    assert shown["kind"] == "solve"
-
-
-@pytest.mark.long
 def test_what_is_imported_is_sent_without_what_lies_beside_it(relit, tmp_path: Path):
     folder, scene = tmp_path / "dome", make_scene(lights=5)
     for number, image in enumerate(scene.images):
@@ -85,7 +76,8 @@ def test_sources_of_all_three_kinds(relit, dome: str, sky: str, tmp_path: Path):
     assert said(registered)["capture"].startswith("cap_")
     named = relit("submit", "relight", dome, "--environment", sky, "--wait", "--priority", "60").well()
     assert "capture" not in said(named)
-    assert "priority 60" in said(relit("jobs", "show", said(named)["job"]).out)["state"]
+    shown = said(relit("jobs", "show", said(named)["job"]).well())
+    assert shown["kind"] == "relight" and "priority 60" in shown["state"]
     one, other = [said(relit("submit", "solve", write_capture(tmp_path / place / "ball"), "--method", "lambert").out)["capture"]
                   for place in ("here", "there")]
     assert one == other

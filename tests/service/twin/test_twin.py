@@ -2,20 +2,15 @@
 
 import csv
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import service
 from service.play.play import play
 from service.requests.play import PlayRequest, TwinRequest
 from service.twin.fixtures import ARTSYNC_S, LOSS_S, DataPacket, Fixtures, SyncPacket, read_artnet, read_sacn
@@ -24,8 +19,8 @@ from service.twin.twin import open_twin, rehearse
 from stage.formats import exr, images
 from tests.scenes.captures import make_scene, ring, write_capture
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
+from tests.service.twin_program import twin_running
 
-ROOT = Path(service.__file__).parents[1]
 LAMPS = 6
 HALF_TOLERANCE = 2e-3
 """The stack holds the images in half."""
@@ -94,11 +89,7 @@ def test_the_page_shows_frames_until_it_is_interrupted(tmp_path):
     capture, host = write_capture(tmp_path / "capture", scene), loopback()
     rig = write_rig_file(tmp_path / "rig.json", scene.directions, host=host)
     cues = write_cues_file(tmp_path / "cues.json", rig, np.full((2, 3 * LAMPS), 255))
-    command = [sys.executable, "-m", "service.cli.main", "twin", rig, capture, "--interface", host, "--port", "0"]
-    program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    try:
-        assert program.stdout.readline() == f"twin     listens on {host} for sACN and Art-Net\n"
-        page = program.stdout.readline().split()[1].removesuffix(":")
+    with twin_running(rig, capture, host) as (program, page):
         stop = threading.Event()
         player = threading.Thread(target=play, args=[PlayRequest(cues=cues, rig=rig, loop=True), stop])
         player.start()
@@ -120,8 +111,6 @@ def test_the_page_shows_frames_until_it_is_interrupted(tmp_path):
         program.send_signal(signal.SIGINT)
         out, _ = program.communicate(timeout=20)
         assert program.returncode == 0 and "received" in out
-    finally:
-        program.kill()
 
 
 def test_bad_input_is_one_sentence(tmp_path, relit):

@@ -3,17 +3,15 @@
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 from service.requests.base.identifiers import ENVIRONMENT
 from service.requests.hooks import NewHook
 from service.requests.jobs import RelightJob
-from service.requests.keys import NewKey, Scope
 from service.server.base.settings import Settings
-from service.server.database import hooks, intakes, jobs, keys, tables
+from service.server.database import hooks, intakes, jobs, tables
 from tests.service.server.process.house import PROJECT, House
-from tests.service.server_process import Server, environment_with
+from tests.service.server_process import Server, environment_with, new_key
 
 SEED = "7"
 CONFIG = """
@@ -57,7 +55,7 @@ checks.positive_data_acceptance.expected-statuses = ["204", "400", "401", "403",
 def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
     """A key, and captures, environments and jobs in several states; no worker is needed."""
     house = House(settings.data, database_url=settings.database_url)
-    key = house.database.transact(partial(keys.insert, wanted=NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN)))
+    key = new_key(house.database, PROJECT)
     captures, environments = [house.capture() for _ in range(3)], [house.capture(ENVIRONMENT) for _ in range(2)]
     for ready in (*captures[:2], environments[0]):
         house.database.transact(lambda connection, ready=ready: intakes.begin_check(connection, ready))

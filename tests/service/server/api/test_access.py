@@ -4,19 +4,18 @@ import hashlib
 import json
 import re
 import time
-from functools import partial
 from typing import NamedTuple
 
 import httpx2
 import pytest
 
 from service.requests.base.identifiers import ANNOTATION, CAPTURE, ENVIRONMENT, HOOK, JOB, UPLOAD, new_id
-from service.requests.keys import NewKey, Scope
-from service.server.database import keys, tables, workers
+from service.requests.keys import Scope
+from service.server.database import tables, workers
 from service.server.database.engine import Database
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
-from tests.service.server_process import Server
+from tests.service.server_process import Server, new_key, revoke
 
 OPEN = {("get", "/healthz"), ("get", "/readyz")}
 """Need no key; nor does OPTIONS, which says what tus can do here."""
@@ -121,15 +120,15 @@ def test_what_is_no_key_of_ours_or_revoked_is_refused(site):
     key = site.server.key("larch", Scope.ADMIN)
     with site.server.client(key) as client:
         assert client.get("/v1/jobs").status_code == 200
-        assert site.database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
+        assert revoke(site.database, key)
         assert client.get("/v1/jobs").status_code == 401
-        assert not site.database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
+        assert not revoke(site.database, key)
 
 
 def test_a_key_that_was_refused_is_told_why_if_its_secret_is_right(site):
     good, revoked = site.server.key("larch"), site.server.key("larch")
-    site.database.transact(partial(keys.revoke, identifier=revoked.partition(".")[0]))
-    expired = site.database.transact(partial(keys.insert, wanted=NewKey(project="larch", name="test", scope=Scope.READ, expires_days=1e-9)))
+    revoke(site.database, revoked)
+    expired = new_key(site.database, scope=Scope.READ, expires_days=1e-9)
     said = {"this service does not know the key": ("x", f"{good}x", f"{revoked}x", f"{expired}x"), "the key was revoked on": (revoked,),
             "the key expired on": (expired,)}
     with site.server.client() as client:

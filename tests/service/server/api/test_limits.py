@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,6 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.requests.base.identifiers import CAPTURE, new_id
-from service.requests.keys import NewKey, Scope
 from service.server.api import context, limits
 from service.server.api.app import create_app
 from service.server.api.limits import CREATION_COST, RateLimiter
@@ -23,6 +21,7 @@ from service.server.database.engine import Database
 from tests.service.server.api.asgi import Call, app_of, asynchronous
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
+from tests.service.server_process import new_key
 
 BURST, QUEUED, FRAMES, FILES, BYTES = 30, 2, 10, 2, 1000
 PER_SECOND = 0.01
@@ -37,7 +36,7 @@ class Site(NamedTuple):
     database: Database
 
     def key(self) -> str:
-        return self.database.transact(partial(keys.insert, wanted=NewKey(project="larch", name="test", scope=Scope.ADMIN)))
+        return new_key(self.database)
 
     def client(self, key: str) -> TestClient:
         return TestClient(self.app, headers={"Authorization": f"Bearer {key}"})

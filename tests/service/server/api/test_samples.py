@@ -1,17 +1,16 @@
 """The sample that comes with Relit, registered by one request, and the project that a key is told it belongs to."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service.errors import RequestError
 from service.requests.base.identifiers import new_id
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.server.base.settings import Settings
-from service.server.database import keys
 from tests.service.server.api.asgi import app_of
+from tests.service.server_process import new_key
 
 KINDS = {"captures": "owl", "environments": "environment.exr"}
 """What each route registers."""
@@ -23,8 +22,8 @@ def of(tmp_path_factory) -> Iterator[Callable[..., TestClient]]:
     settings = Settings(data=tmp_path_factory.mktemp("samples"), project_quotas="elm:max_project_captures=1", min_free_bytes=0)
     with app_of(settings) as app:
         def client(project: str, scope: Scope = Scope.WRITE) -> TestClient:
-            key = app.state.service.database.transact(partial(keys.insert, wanted=NewKey(project=project, name="test", scope=scope)))
-            return TestClient(app, base_url="http://localhost", headers={"Authorization": f"Bearer {key}"})
+            headers = {"Authorization": f"Bearer {new_key(app.state.service.database, project, scope)}"}
+            return TestClient(app, base_url="http://localhost", headers=headers)
 
         yield client
 

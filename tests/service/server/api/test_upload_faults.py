@@ -8,20 +8,19 @@ import signal
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import pytest
 from fastapi.testclient import TestClient
 
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.server.api import uploads as api_uploads
 from service.server.base.settings import Settings
-from service.server.database import keys, tables
+from service.server.database import tables
 from service.server.storage.part_files import PartFile, PartFileLocked
 from tests.service.server.api.asgi import app_of
 from tests.service.server.api.test_uploads import begun, made, part, stored
 from tests.service.server.api.tus import Tus, checksum, encoded
-from tests.service.server_process import serving
+from tests.service.server_process import new_key, revoke, serving
 from tests.service.waiting import at_once
 
 KIB, MIB = 1 << 10, 1 << 20
@@ -191,12 +190,11 @@ def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(tmp_path, monkeypatch
     write_body = api_uploads.write_body
     with app_of(Settings(data=tmp_path / "data", min_free_bytes=0)) as app:
         database = app.state.service.database
-        wanted = NewKey(project="larch", name="x", scope=Scope.WRITE)
-        key, other = (database.transact(partial(keys.insert, wanted=wanted)) for _ in range(2))
+        key, other = (new_key(database, scope=Scope.WRITE) for _ in range(2))
 
         async def write_and_revoke(*arguments) -> None:
             await write_body(*arguments)
-            database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
+            revoke(database, key)
 
         monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
         with TestClient(app, headers={"Authorization": f"Bearer {key}", "Tus-Resumable": "1.0.0"}) as client:

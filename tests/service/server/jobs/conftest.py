@@ -1,26 +1,16 @@
 """Both databases, and a small capture with what `relit relight` makes of it."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from tests.scenes.captures import make_scene, write_capture, write_exr
-from tests.service.server.jobs.harness import harness, relit_relight
+from tests.service.server.jobs.harness import Undisturbed, harness, relit_relight
 
 FRAMES = 36
 SIZE = 256
 """Of the images: large enough that a frame takes some hundredths of a second, so that workers die between frames."""
-
-
-class Undisturbed(NamedTuple):
-    """What nobody disturbed."""
-
-    capture: Path
-    environment: Path
-    frames: int
-    digests: dict[str, str]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus
@@ -20,12 +20,13 @@ from service.requests.relight import RelightOptions
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
+from service.server.database.jobs import Claim
 from service.server.jobs.context import WorkerContext
 from service.server.jobs.queue import JobQueue, workflow_id
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
 from tests.service.server.prepared import prepare
-from tests.service.server_process import JsonLog, environment_with
+from tests.service.server_process import SABOTAGE, JsonLog, environment_with
 from tests.service.waiting import until
 
 PROJECT = "tests"
@@ -33,6 +34,15 @@ CAPTURES = ("capture", "registered", "undisturbed")
 """How the names of folders with captures begin."""
 WAIT_S = 120.0
 """Far beyond what anything takes here, so that a slow machine fails no test."""
+
+
+class Undisturbed(NamedTuple):
+    """What nobody disturbed."""
+
+    capture: Path
+    environment: Path
+    frames: int
+    digests: dict[str, str]
 
 
 class Harness:
@@ -51,13 +61,15 @@ class Harness:
         self._environment = environment_with(**settings, **({} if database_url is None else {"database_url": database_url}))
         self.supervisors: list[subprocess.Popen[bytes]] = []
 
-    def context(self, **changed: Any) -> WorkerContext:
+    def context(self, settings: Settings | None = None, **changed: Any) -> WorkerContext:
         """What the steps of a worker in this process get, with some settings changed."""
-        settings = self.settings.model_copy(update=changed)
+        settings = (settings or self.settings).model_copy(update=changed)
         return WorkerContext(settings, self.database, open_storage(settings), self.queue, "cpu", "")
 
-    def start(self, **environment: str) -> subprocess.Popen[bytes]:
-        """Another `relit worker`, in a process group of its own."""
+    def start(self, sabotage: str | None = None, **environment: str) -> subprocess.Popen[bytes]:
+        """Another `relit worker`, in a process group of its own; what it does with frames, as sabotage/ tells."""
+        if sabotage is not None:
+            environment |= {"PYTHONPATH": SABOTAGE, "SABOTAGE": sabotage}
         with open(self.log, "ab") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", "service.cli.main", "worker", "--device", "cpu", "--data", str(self.settings.data)],
@@ -88,6 +100,29 @@ class Harness:
     def relight(self, capture: str, environment: str, frames: int, *, chunk_frames: int) -> str:
         return self.submit(RelightJob(kind="relight", capture=capture, environment=environment,
                                       options=RelightOptions(frames=f"1-{frames}", spin_degrees=360)), chunk_frames=chunk_frames)
+
+    def begin(self, undisturbed: Undisturbed, *, chunk_frames: int = 8) -> str:
+        """Submit the job that makes the frames that nobody disturbed."""
+        return self.relight(self.register(undisturbed.capture, CAPTURE), self.register(undisturbed.environment, ENVIRONMENT),
+                            undisturbed.frames, chunk_frames=chunk_frames)
+
+    def made_whole(self, job: str, undisturbed: Undisturbed) -> sa.RowMapping:
+        """Wait for a job that succeeds, with the frames that nobody disturbed and no file besides, hidden ones neither."""
+        row = self.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert digests(self.results(job)) == undisturbed.digests
+        return row
+
+    def two_steps(self) -> str:
+        """Submit a job of two steps, of a capture that nobody looks for."""
+        return self.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+
+    def claim(self, job: str, worker: str) -> Claim:
+        """Let a worker take a job and begin it."""
+        self.take(job, worker)
+        claim = Claim(job, 1, worker)
+        assert jobs.begin(self.database, claim)
+        return claim
 
     def request(self, job: str) -> JobRequest:
         return ANY_JOB.validate_python(self.row(job)["request"])

@@ -10,15 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
 from tests.service.server.jobs.harness import PROJECT, digests, harness
-from tests.service.server_process import SABOTAGE
-
-
-def begin(made, undisturbed, *, frames=None, chunk_frames=8):
-    return made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
-                        frames or undisturbed.frames, chunk_frames=chunk_frames)
 
 
 def frames_there(made, job, count):
@@ -29,15 +22,13 @@ def frames_there(made, job, count):
 def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postgres, undisturbed):
     with harness(tmp_path, on_postgres, takeover_s=0.5) as made:
         for _ in range(2):
-            made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+            made.start("slow")
         there = {row["id"] for row in made.ready(2)}
-        job = begin(made, undisturbed, chunk_frames=6)
+        job = made.begin(undisturbed, chunk_frames=6)
         for frames, mode, away_s in ((4, "fast", 0.0), (13, "immediate", 0.0), (22, "fast", 3.0)):
             frames_there(made, job, frames)
             server_postgres.restart(mode, away_s=away_s)
-        row = made.ended(job)
-        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-        assert digests(made.results(job)) == undisturbed.digests
+        assert made.made_whole(job, undisturbed)["lost"] == 0
         made.never_two_at_once(job)
         assert {row["id"] for row in made.ready(2)} == there
         assert [event for event in made.events() if event["event"] in ("worker died", "worker is gone")] == []
@@ -47,9 +38,9 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
 @pytest.mark.parametrize("how", ["stopped", "in a step"])
 def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
     with harness(tmp_path, stall_s=10, takeover_s=0.5) as made:  # a worker on a loaded machine takes some seconds to begin
-        made.start(**({} if how == "stopped" else {"PYTHONPATH": SABOTAGE, "SABOTAGE": "hang"}))
+        made.start(None if how == "stopped" else "hang")
         made.ready(1)
-        job = begin(made, undisturbed)
+        job = made.begin(undisturbed)
         victim = made.holder(job)
         if how == "stopped":
             frames_there(made, job, 1)
@@ -57,19 +48,16 @@ def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undistur
             os.kill(made.pid_of(victim), signal.SIGSTOP)  # the worker in its place will be a good one
         else:
             made.start()
-        row = made.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
-        assert row["worker"] != victim
-        assert digests(made.results(job)) == undisturbed.digests
+        assert made.made_whole(job, undisturbed)["worker"] != victim
         assert any(event["event"] == "worker hangs: it is killed" for event in made.events())
 
 
 @pytest.mark.long
 def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(tmp_path, on_postgres, undisturbed):
     with harness(tmp_path, on_postgres) as made:
-        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        worker = made.start("slow")
         made.ready(1)
-        job = begin(made, undisturbed, chunk_frames=12)
+        job = made.begin(undisturbed, chunk_frames=12)
         frames_there(made, job, 14)  # in the second step, a second before its end
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(60) == 0
@@ -79,16 +67,15 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         assert len(digests(made.results(job))) == 24
         assert workers.seen_lately(made.database) == []
         made.start()
-        assert made.ended(job)["state"] == jobs.SUCCEEDED
-        assert digests(made.results(job)) == undisturbed.digests
+        made.made_whole(job, undisturbed)
 
 
 @pytest.mark.long
 def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
     with harness(tmp_path, drain_s=1) as made:
-        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="hang")
+        worker = made.start("hang")
         made.ready(1)
-        job = begin(made, undisturbed)
+        job = made.begin(undisturbed)
         made.holder(job)
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(30) == 0
@@ -99,9 +86,9 @@ def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
 @pytest.mark.long
 def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
     with harness(tmp_path) as made:
-        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        worker = made.start("slow")
         made.ready(1)
-        job = begin(made, undisturbed, chunk_frames=6)
+        job = made.begin(undisturbed, chunk_frames=6)
         frames_there(made, job, 1)
         os.kill(worker.pid, signal.SIGKILL)
         made.until(lambda: made.row(job)["state"] == jobs.QUEUED, "handed back")
@@ -113,8 +100,8 @@ def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbe
 @pytest.mark.long
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
     with harness(tmp_path, max_lost=1, takeover_s=0.2) as made:
-        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="kill")
-        job = begin(made, undisturbed)
+        made.start("kill")
+        job = made.begin(undisturbed)
         row = made.ended(job)
         assert (row["state"], row["lost"]) == (jobs.FAILED, 2)
         assert row["error"].startswith("lost 2 workers without progress (frames): ")
@@ -157,7 +144,7 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         made.start()
         made.ready(1)
         ballast = fill(small_disk, leave=3_500_000)  # the stack of images, and some frames
-        job = begin(made, undisturbed)
+        job = made.begin(undisturbed)
         row = made.ended(job)
         assert row["state"] == jobs.FAILED
         assert row["error"].startswith("cannot write ") and "no space left" in row["error"].lower()
@@ -169,9 +156,7 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         assert attempt == 2
         request = made.request(job)
         made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request, request.priority, PROJECT))
-        row = made.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
-        assert digests(made.results(job)) == undisturbed.digests
+        made.made_whole(job, undisturbed)
 
 
 WORKERS = 2
@@ -189,12 +174,11 @@ def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, ki
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
-        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
-                           undisturbed.frames, chunk_frames=8)
+        job = made.begin(undisturbed)
         kill_at = sorted(chance.sample(range(undisturbed.frames // 2), kills))  # frames that are there
         victim = None
         for kill, frames in enumerate(kill_at):
-            made.until(lambda at=frames: made.frames_there(job) >= at, f"{frames} frames", every_s=0.002)
+            frames_there(made, job, frames)
             victim = made.holder(job, other_than=victim)
             pid = made.pid_of(victim)
             if kill % 2:  # with the process that looks after it, as a machine dies
@@ -204,8 +188,5 @@ def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, ki
                 made.start()
             else:
                 os.kill(pid, signal.SIGKILL)
-        row = made.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
-        assert row["worker"] != victim
-        assert digests(made.results(job)) == undisturbed.digests  # and no file besides, hidden ones neither
+        assert made.made_whole(job, undisturbed)["worker"] != victim
         made.never_two_at_once(job)

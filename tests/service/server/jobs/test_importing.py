@@ -58,11 +58,8 @@ class Killed(BaseException):
     """As if the process had ended."""
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
-@pytest.mark.parametrize("last", ["before", "after"])
-def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):
-    identifier, names = uploaded
+def run_killed(harness, identifier, monkeypatch, last):
+    """Run an import that is killed before or after what it made is stored."""
     put = FolderStorage.put
 
     def killed(self, *arguments):
@@ -73,7 +70,15 @@ def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harn
     with monkeypatch.context() as patched:
         patched.setattr(FolderStorage, "put", killed)
         with pytest.raises(Killed):
-            run(idle_harness, identifier)
+            run(harness, identifier)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
+@pytest.mark.parametrize("last", ["before", "after"])
+def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):
+    identifier, names = uploaded
+    run_killed(idle_harness, identifier, monkeypatch, last)
     assert intakes.find(idle_harness.database, identifier, PROJECT)["state"] == "checking"
     assert stored(idle_harness, identifier)[1] == names
     run(idle_harness, identifier)
@@ -126,16 +131,7 @@ def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_h
 @ON_SQLITE
 def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness, uploaded, monkeypatch):
     identifier, names = uploaded
-    put = FolderStorage.put
-
-    def killed(self, *arguments):
-        put(self, *arguments)
-        raise Killed
-
-    with monkeypatch.context() as patched:
-        patched.setattr(FolderStorage, "put", killed)
-        with pytest.raises(Killed):
-            run(idle_harness, identifier)
+    run_killed(idle_harness, identifier, monkeypatch, "after")
     intakes.refuse(idle_harness.database, identifier, "its worker was lost too often")
     idle_harness.database.transact(lambda connection: intakes.begin_check(connection, identifier))
     with pytest.raises(RequestError, match=r"capture\.json"):

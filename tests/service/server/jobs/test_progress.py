@@ -7,7 +7,6 @@ import pytest
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
@@ -26,7 +25,7 @@ def claim(tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     monkeypatch.setattr(progress, "UNANSWERED_S", 0.0)
     with harness(tmp_path) as made:
-        job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+        job = made.two_steps()
         claim = Claim(job, 1, "one")
         jobs.begin(made.database, claim)
         yield made, claim
@@ -118,9 +117,8 @@ def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
 @pytest.fixture
 def running(idle_harness, monkeypatch):
     """The pieces of a job that another worker does; the folder of a piece is deleted while it is written."""
-    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
-    idle_harness.take(job, "one")
-    jobs.begin(idle_harness.database, Claim(job, 1, "one"))
+    job = idle_harness.two_steps()
+    idle_harness.claim(job, "one")
 
     @contextmanager
     def in_a_folder_that_goes(file):

@@ -7,10 +7,9 @@ import time
 
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import SolveJob
 from service.server.database import jobs
-from service.server.database.jobs import Claim
 from service.server.jobs.queue import job_and_attempt
 from tests.service.server.jobs.harness import harness
 
@@ -41,7 +40,7 @@ def test_workers_take_jobs_by_priority_and_time_and_projects_take_turns(tmp_path
 
 def test_a_changed_priority_is_that_of_the_queue(idle_harness):
     """Without another attempt, and among equal priorities the job keeps its place."""
-    first, second, third = (idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5) for _ in range(3))
+    first, second, third = (idle_harness.two_steps() for _ in range(3))
     before = idle_harness.row(second)
 
     def change(connection, job, priority):
@@ -60,6 +59,5 @@ def test_a_changed_priority_is_that_of_the_queue(idle_harness):
     assert order() == [second, third, first]
     row = idle_harness.row(second)
     assert (row["attempt"], row["revision"], row["state"]) == (1, before["revision"] + 1, jobs.QUEUED)
-    idle_harness.take(second, "one")
-    jobs.begin(idle_harness.database, Claim(second, 1, "one"))
+    idle_harness.claim(second, "one")
     assert idle_harness.database.transact(lambda connection: jobs.set_priority(connection, second, 1)) is None  # it runs

@@ -8,7 +8,6 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from service import __version__
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module
@@ -30,7 +29,7 @@ def runner(idle_harness, monkeypatch):
     """A worker `one` that has taken a job of two steps."""
     monkeypatch.setattr(runner_module, "FIRST_PAUSE_S", 0.0)
     made = JobRunner(idle_harness.context(), "one", alive=lambda oldest: None)
-    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+    job = idle_harness.two_steps()
     idle_harness.take(job, "one")
     return made, Claim(job, 1, "one")
 
@@ -154,7 +153,7 @@ def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, ru
 def test_a_cancelled_step_ends_before_the_next_job_works_on_the_device(idle_harness, runner, monkeypatch):
     """The queue gives a worker the next job as soon as one is cancelled; two that capture graphs on one GPU would end the process."""
     made, first = runner
-    second = Claim(idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5), 1, "one")
+    second = Claim(idle_harness.two_steps(), 1, "one")
     idle_harness.take(second.job, "one")
     begun, cancelled, order = threading.Event(), threading.Event(), []
 

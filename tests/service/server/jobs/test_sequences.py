@@ -17,7 +17,6 @@ from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
-from service.server.storage.objects import open_storage
 from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step
@@ -55,11 +54,6 @@ def solve_of(harness, sequence, **options) -> Job:
     return Job(new_id("job"), PROJECT, request, 1)
 
 
-def context_of(harness, settings: Settings, sequence) -> WorkerContext:
-    settings = settings.model_copy(update={"roots": (sequence.parent,)})
-    return harness.context()._replace(settings=settings, storage=open_storage(settings))
-
-
 def run(job: Job, context: WorkerContext, name: str) -> None:
     """What the worker does in a step."""
     with places_named():
@@ -72,7 +66,7 @@ def run(job: Job, context: WorkerContext, name: str) -> None:
 def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence, undisturbed, tmp_path, monkeypatch):
     """Each finds what the other has left in the store, and joins without solving again."""
     job = solve_of(idle_harness, sequence)
-    contexts = [context_of(idle_harness, Settings(data=tmp_path / name, storage_url=f"file://{tmp_path}/store"), sequence)
+    contexts = [idle_harness.context(Settings(data=tmp_path / name, storage_url=f"file://{tmp_path}/store"), roots=(sequence.parent,))
                 for name in ("one", "other")]
     names = [step.name for step in steps_of(job, contexts[0])]
     assert names == [*(f"step {number}" for number in range(1, STEPS + 1)), "sequence"]
@@ -93,7 +87,7 @@ def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):
     capture = idle_harness.register(sequence, CAPTURE, captures=STEPS + 1, steps=STEPS + 1)
     job = Job(new_id("job"), PROJECT, DepthJob(kind="depth", capture=capture), 1)
     with pytest.raises(ManifestError, match="has 4 steps now, and had more when it was checked"):
-        run(job, context_of(idle_harness, idle_harness.settings, sequence), f"step {STEPS + 1}")
+        run(job, idle_harness.context(roots=(sequence.parent,)), f"step {STEPS + 1}")
 
 
 @pytest.mark.long

@@ -5,7 +5,6 @@ import threading
 import pytest
 import sqlalchemy as sa
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs, workers
 from service.server.database.jobs import Claim, StageProgress
 from service.server.jobs.progress import JobProgress
@@ -20,9 +19,8 @@ MAX_LOST = 3
 @pytest.fixture
 def job(idle_harness):
     """A job that the worker `gone`, which is not there any more, has begun."""
-    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
-    idle_harness.take(job, "gone")
-    assert jobs.begin(idle_harness.database, Claim(job, 1, "gone"))
+    job = idle_harness.two_steps()
+    idle_harness.claim(job, "gone")
     return job
 
 
@@ -86,8 +84,7 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
     assert not jobs.end(idle_harness.database, gone, jobs.FAILED, "it says")
     assert not jobs.is_claimed(idle_harness.database, gone)
     assert dict(idle_harness.row(job)) == before
-    idle_harness.take(job, "two")
-    assert jobs.begin(idle_harness.database, Claim(job, 1, "two"))
+    idle_harness.claim(job, "two")
     assert not jobs.begin(idle_harness.database, gone)  # it had taken the job, and wakes up only now
     assert not idle_harness.database.transact(lambda connection: jobs.release(connection, gone))
     assert idle_harness.row(job)["worker"] == "two"
@@ -96,10 +93,8 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
 def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_path):
     """Why the worker stands in the job's row: PostgreSQL looks again at the row that it waited for, and at no other."""
     with harness(tmp_path, on_postgres) as made:
-        job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
-        gone = Claim(job, 1, "gone")
-        made.take(job, "gone")
-        assert jobs.begin(made.database, gone)
+        job = made.two_steps()
+        gone = made.claim(job, "gone")
         ended = []
         late = threading.Thread(target=lambda: ended.append(jobs.end(made.database, gone, jobs.SUCCEEDED)))
         with made.database.engine.begin() as connection:
@@ -129,8 +124,7 @@ def test_a_second_reaper_finds_nothing_to_do(idle_harness, takeover, job, monkey
     _, second = takeover("two")
     before = idle_harness.queue.taken_by()
     first.round()
-    idle_harness.take(job, "one")
-    jobs.begin(idle_harness.database, Claim(job, 1, "one"))
+    idle_harness.claim(job, "one")
     looks = iter([before])  # the second had looked before the first was there
     taken_by = idle_harness.queue.taken_by
     monkeypatch.setattr(idle_harness.queue, "taken_by", lambda: next(looks, None) or taken_by())
@@ -147,8 +141,7 @@ def test_a_job_that_loses_too_many_workers_fails(idle_harness, takeover, job):
         one.round()
         assert idle_harness.row(job)["lost"] == lost
         if lost <= MAX_LOST:
-            idle_harness.take(job, "gone")
-            jobs.begin(idle_harness.database, Claim(job, 1, "gone"))
+            idle_harness.claim(job, "gone")
     row = idle_harness.row(job)
     assert row["state"] == jobs.FAILED and row["error"].startswith("lost 4 workers without progress (open): ")
     assert idle_harness.in_queue(job)[0] == "CANCELLED"
@@ -160,8 +153,7 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, tak
 
     def lose():
         one.round()
-        idle_harness.take(job, "gone")
-        jobs.begin(database, gone)
+        idle_harness.claim(job, "gone")
 
     lose()
     jobs.advance(database, gone, StageProgress("frames", 4, 10, None))
@@ -191,8 +183,7 @@ def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_jo
     def lose():
         one.round()
         if idle_harness.row(job)["state"] == jobs.QUEUED:
-            idle_harness.take(job, "gone")
-            jobs.begin(database, gone)
+            idle_harness.claim(job, "gone")
         row = idle_harness.row(job)
         return row["lost"], row["lost_repeating"]
 

@@ -42,6 +42,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         yield running
 
 
+@pytest.fixture(scope="session")
+def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server that wants keys."""
+    with serving(tmp_path_factory.mktemp("locked"), "--device", "none", roots=str(SAMPLES)) as running:
+        yield running
+
+
 @pytest.fixture(scope="module")
 def browser():
     """Headless Chromium. It ends with its module: Playwright keeps an event loop in this thread, beside which no other can run."""

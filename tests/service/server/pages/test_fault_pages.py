@@ -1,15 +1,13 @@
 """What goes wrong is said on a page to browsers, and in a problem document to programs; a key that is refused is told why."""
 
 import re
-from functools import partial
 
 import pytest
 
-from service.requests.keys import NewKey, Scope
-from service.server.database import keys
+from service.requests.keys import Scope
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import SAMPLES, expect, new_context
-from tests.service.server_process import serving
+from tests.service.server_process import new_key, revoke, serving
 
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 HTML = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -44,8 +42,8 @@ def test_what_does_not_exist_is_a_page_with_a_way_on(browser, server, path):
 def test_a_key_that_is_refused_is_told_why(browser, tmp_path):
     with serving(tmp_path, "--device", "none", roots=str(SAMPLES)) as locked, locked.database() as database:
         good, revoked = locked.key(scope=Scope.READ), locked.key()
-        database.transact(partial(keys.revoke, identifier=revoked.partition(".")[0]))
-        expired = database.transact(partial(keys.insert, wanted=NewKey(project="larch", name="test", scope=Scope.READ, expires_days=1e-9)))
+        revoke(database, revoked)
+        expired = new_key(database, scope=Scope.READ, expires_days=1e-9)
         page = new_context(browser, base_url=locked.url, bypass_csp=True).new_page()
         page.goto("/captures")
         fault = page.locator("#key-fault")

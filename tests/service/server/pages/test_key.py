@@ -1,25 +1,9 @@
 """A service that wants keys: the page asks for one, keeps it in its tab, and says what a key does not allow."""
 
-import re
-import subprocess
-import sys
-
 import pytest
 
+from service.requests.keys import Scope
 from tests.service.server.pages.conftest import SAMPLES, new_context
-from tests.service.server_process import Server, serving
-
-
-@pytest.fixture(scope="module")
-def locked(tmp_path_factory: pytest.TempPathFactory):
-    with serving(tmp_path_factory.mktemp("locked"), "--device", "none", roots=str(SAMPLES)) as running:
-        yield running
-
-
-def key_of(server: Server, scope: str) -> str:
-    done = subprocess.run([sys.executable, "-m", "service.cli.main", "keys", "create", "--data", server.data, "--project", "owls",
-                           "--name", scope, "--scope", scope], capture_output=True, text=True, timeout=60, check=True)
-    return re.search(r"relit_\S+", done.stdout)[0] if "relit_" in done.stdout else done.stdout.split()[-1]
 
 
 @pytest.mark.long
@@ -29,7 +13,7 @@ def test_the_page_asks_for_a_key_and_keeps_it_in_the_tab(browser, locked):
     page.goto("/captures")
     page.get_by_label("Key", exact=True).last.fill("wrong")
     page.get_by_role("button", name="Use this key").click()
-    page.get_by_label("Key", exact=True).last.fill(key_of(locked, "read"))
+    page.get_by_label("Key", exact=True).last.fill(locked.key("owls", Scope.READ))
     page.get_by_role("button", name="Use this key").click()
     page.locator("#captures").get_by_text("There are no captures yet.").wait_for()
     page.reload()

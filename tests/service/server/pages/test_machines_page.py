@@ -5,7 +5,7 @@ import pytest
 
 from service.requests.keys import Scope
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import SAMPLES, await_whole, expect, keep, new_context
+from tests.service.server.pages.conftest import await_whole, expect, keep, new_context
 from tests.service.server_process import serving
 
 pytestmark = pytest.mark.long
@@ -17,12 +17,6 @@ def opened(browser, url: str, key: str, **options):
     page.add_init_script(f"sessionStorage.setItem('relit-key', '{key}')")
     page.goto("/machines")
     return page
-
-
-@pytest.fixture(scope="module")
-def locked(tmp_path_factory: pytest.TempPathFactory):
-    with serving(tmp_path_factory.mktemp("machines"), "--device", "none", roots=str(SAMPLES)) as running:
-        yield running
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,6 +1,5 @@
 """Patterns through the page in a browser: a camera that sees the window pixel by pixel decodes where each pixel of the projector is."""
 
-import json
 import logging
 import threading
 from pathlib import Path
@@ -17,6 +16,7 @@ from service.requests.depth import DepthRequest
 from stage.capture.capture import Capture
 from stage.formats import exr, images
 from stage.patterns.codes import draw
+from tests.scenes.patched_rigs import write_plan
 from tests.service.server.pages.conftest import new_context
 from tests.service.waiting import PATIENCE_S
 
@@ -68,17 +68,16 @@ def watched(tmp_path) -> Path:
     return folder
 
 
-def request_of(tmp_path: Path, watched: Path, plan: dict, size: tuple[int, int]) -> AcquireRequest:
-    (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, **plan}))
-    return AcquireRequest(plan=str(tmp_path / "plan.json"), camera=f"watch:{watched}", trigger=f"touch {watched / RELEASED}",
+def request_of(tmp_path: Path, watched: Path, size: tuple[int, int], *sequences: dict) -> AcquireRequest:
+    return AcquireRequest(plan=str(write_plan(tmp_path, *sequences)), camera=f"watch:{watched}", trigger=f"touch {watched / RELEASED}",
                           out=tmp_path / "capture", projector=size, projector_port=0, color_space="lin_rec709_scene", timeout=PATIENCE_S)
 
 
 @pytest.mark.long
 def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_path, watched):
     size = 520, 513  # ten bits each
-    plan = {"sequences": [{"take": "patterns", "code": "gray", "axis": "both"}, {"take": "patterns", "code": "phase"}]}
-    request = request_of(tmp_path, watched, plan, size)
+    plan = {"take": "patterns", "code": "gray", "axis": "both"}, {"take": "patterns", "code": "phase"}
+    request = request_of(tmp_path, watched, size, *plan)
     page = new_context(browser, viewport={"width": size[0], "height": size[1]}).new_page()
     result = capture_shown(page, request, watched)
     page.context.close()
@@ -97,7 +96,7 @@ def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_pa
 def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp_path, watched):
     """Two pixels of the screen for each of the page's, which is full screen; stripes of one pixel are exact."""
     size = 160, 96
-    request = request_of(tmp_path, watched, {"sequences": [{"take": "patterns", "code": "gray", "axis": "both"}]}, size)
+    request = request_of(tmp_path, watched, size, {"take": "patterns", "code": "gray", "axis": "both"})
     page = new_context(browser, viewport={"width": size[0] // 2, "height": size[1] // 2}, device_scale_factor=2).new_page()
     result = capture_shown(page, request, watched, clicked=True)
     page.context.close()
@@ -110,7 +109,7 @@ def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp
 
 @pytest.mark.long
 def test_a_window_of_another_size_is_refused(browser, tmp_path, watched):
-    request = request_of(tmp_path, watched, {"sequences": [{"take": "patterns", "code": "ramp"}]}, (640, 480))
+    request = request_of(tmp_path, watched, (640, 480), {"take": "patterns", "code": "ramp"})
     page = new_context(browser, viewport={"width": 600, "height": 400}).new_page()
     for timeout in (2.0, PATIENCE_S):  # in the first, a slow machine may not open the window
         refused = capture_shown(page, request.model_copy(update={"timeout": timeout}), watched)

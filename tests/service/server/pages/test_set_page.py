@@ -1,9 +1,6 @@
 """The page of the stage: captures of the twin of a stage, from the first click to an asset, mended, metered, and under a projector."""
 
 import json
-import os
-import subprocess
-import sys
 from contextlib import contextmanager, suppress
 from ctypes.util import find_library
 from pathlib import Path
@@ -16,11 +13,13 @@ from service.acquisition.cameras.aravis_camera import LIBRARY
 from stage.capture.capture import Capture
 from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
+from tests.scenes.video import write_video
+from tests.service.acquisition.test_acquire import posting
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, keep, new_context
 from tests.service.server_process import serving
+from tests.service.twin_program import twin_running
 
-ROOT = SAMPLES.parent
 LAMPS = 7
 DEAD = "dead@5,dead@6,dead@7"
 """The releases at which no lamp shines: a dark picture and the chart are the first, so this is the third lamp, at every attempt."""
@@ -38,18 +37,11 @@ def stage(folder: Path, *options: object, sample: bool = False, serve: tuple[obj
         scene = make_scene(size=64, lights=LAMPS)
         capture, directions = write_capture(folder / "scene", scene), scene.directions
     rig = write_rig_file(folder / "rig.json", directions, host=host, name="the little dome")
-    command = [sys.executable, "-m", "service.cli.main", "twin", rig, capture, "--interface", host, "--port", "0", "--pictures", watched,
-               "--picture-format", "png", "--noise", "0.001", "--exposure", "-1" if sample else "0", "--cache", folder, *options]
-    twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    try:
-        assert twin.stdout.readline().startswith("twin ")
-        page = twin.stdout.readline().split()[1].removesuffix(":")
-        shoot = f"{sys.executable} -S -c \"import urllib.request as u; u.urlopen(u.Request('{page}/release', method='POST'))\""
-        with serving(folder / "data", "--anonymous", "--set", rig, "--camera", f"watch:{watched}", "--trigger", shoot, *serve) as server:
-            yield server, server.data / "set"
-    finally:
-        twin.kill()
-        twin.wait()
+    with twin_running(rig, capture, host, "--pictures", watched, "--picture-format", "png", "--noise", "0.001",
+                      "--exposure", "-1" if sample else "0", "--cache", folder, *options) as (_, page), \
+            serving(folder / "data", "--anonymous", "--set", rig, "--camera", f"watch:{watched}", "--trigger", posting(f"{page}/release"),
+                    *serve) as server:
+        yield server, server.data / "set"
 
 
 @contextmanager
@@ -330,13 +322,9 @@ def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_pat
 
 @pytest.mark.long
 def test_the_live_view_says_what_clips_and_ends_before_a_capture(browser, tmp_path):
-    path = tmp_path / "video.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     frame = np.full((48, 64, 3), 90, np.uint8)
     frame[:, 32:] = 255
-    for _ in range(30):
-        writer.write(frame)
-    writer.release()
+    path = write_video(tmp_path / "video.avi", [frame] * 30)
     rig = write_rig_file(tmp_path / "rig.json", make_scene(size=8, lights=LAMPS).directions, host=loopback(), name="the little dome")
     with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", f"video:{path}") as server, \
             opened(browser, server, bypass_csp=True) as page:

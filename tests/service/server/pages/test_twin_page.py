@@ -1,11 +1,9 @@
 """The page of relit twin in a browser: the owl under a warm sun and a blue sky, as its lamps are driven."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import threading
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -14,8 +12,7 @@ from service.play.play import play
 from service.requests.play import PlayRequest
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
 from tests.service.server.pages.conftest import SAMPLES, expect, keep, new_context
-
-ROOT = SAMPLES.parent
+from tests.service.twin_program import twin_running
 
 
 @pytest.mark.long
@@ -27,13 +24,9 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
     levels = np.outer(near[0], [1, 0.7, 0.4]) + np.outer(near[1], [0.05, 0.15, 0.5])
     steps = np.round(255 * np.minimum(levels, 1)).astype(int).reshape(1, -1)
     cues, stop = write_cues_file(tmp_path / "cues.json", rig, steps), threading.Event()
-    command = [sys.executable, "-m", "service.cli.main", "twin", rig, SAMPLES / "owl", "--cache", tmp_path, "--interface", host,
-               "--port", "0"]
-    program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     player = threading.Thread(target=play, args=[PlayRequest(cues=cues, rig=rig, hold=1), stop])
-    try:
-        assert program.stdout.readline().startswith("twin ")
-        address = program.stdout.readline().split()[1].removesuffix(":")
+    with twin_running(rig, SAMPLES / "owl", host, "--cache", tmp_path) as (program, address), ExitStack() as ending:
+        ending.callback(stop.set)
         context = new_context(browser, viewport={"width": 1000, "height": 640})
         page, errors = context.new_page(), []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -59,6 +52,3 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         page.locator("#state", has_text="The twin has ended.").wait_for()
         context.close()
         assert errors == []
-    finally:
-        stop.set()
-        program.kill()

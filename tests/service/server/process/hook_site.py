@@ -61,11 +61,8 @@ class Site:
         return hooks.listing(self.database, PROJECT, hook["id"])[0]["due_at"]
 
     def tidy(self, later_s: float) -> None:
-        self.house.keeper.round()
-        self.house.now += later_s
-        self.house.keeper.round()
-        self.house.now += 86_400  # the clock jumped: for a day nothing is removed
-        self.house.keeper.round()
+        for seconds in (0.0, later_s, 86_400):  # the clock jumped: for a day nothing is removed
+            self.house.round(seconds)
 
     def log(self, job: str) -> list[str]:
         return [row["text"] for row in jobs.log_of(self.database, job)]

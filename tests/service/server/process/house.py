@@ -32,6 +32,11 @@ class House:
         self.keeper = Housekeeper(self.settings, self.database, self.storage, self.queue, clock=lambda: self.now,
                                   monotonic=lambda: self.now - self.jumped)
 
+    def round(self, later_s: float = 0.0) -> None:
+        """Keep house after some time."""
+        self.now += later_s
+        self.keeper.round()
+
     def capture(self, kind: str = CAPTURE) -> str:
         made = new_id(kind)
         self.database.transact(lambda connection: intakes.insert(

@@ -5,13 +5,11 @@ import shutil
 
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.process.backup import CONTENTS, backup, restore
 from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
-from tests.service.server.jobs.harness import digests, harness
-from tests.service.server_process import SABOTAGE
+from tests.service.server.jobs.harness import harness
 
 
 @pytest.mark.long
@@ -21,9 +19,8 @@ def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_u
         pytest.skip("the client programs of PostgreSQL are not on the path")
     roots = str(undisturbed.capture.parent)
     with harness(tmp_path / "first", database_url, roots=roots) as made:
-        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backup
-        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
-                           undisturbed.frames, chunk_frames=6)
+        made.start("slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backup
+        job = made.begin(undisturbed, chunk_frames=6)
         made.until(lambda: made.frames_there(job) >= 8, "8 frames")
         saved = backup(made.settings, tmp_path / "saved")
         assert made.row(job)["state"] == jobs.RUNNING
@@ -31,8 +28,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_u
         frames = [name for name in contents if name.endswith(".exr")]
         assert saved.files == len(contents) and 8 <= len(frames) < undisturbed.frames
         (tmp_path / "gate").touch()
-        assert made.ended(job)["state"] == jobs.SUCCEEDED  # the backup did not disturb it
-        assert digests(made.results(job)) == undisturbed.digests
+        made.made_whole(job, undisturbed)  # the backup did not disturb it
     second = None if database_url is None else request.getfixturevalue("server_postgres").new_database()
     restore(Settings(data=tmp_path / "second" / "data", database_url=second), tmp_path / "saved")
     with harness(tmp_path / "second", second, takeover_s=0.5, roots=roots) as again:
@@ -41,9 +37,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_u
         kept = {path.name: path.stat().st_mtime_ns for path in again.results(job).iterdir()}
         assert len(kept) == len(frames)
         again.start()
-        row = again.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
-        assert digests(again.results(job)) == undisturbed.digests
+        again.made_whole(job, undisturbed)
         assert {name: (again.results(job) / name).stat().st_mtime_ns for name in kept} == kept  # frames that were there stay
 
 

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 
 import httpx2
 import pytest
@@ -17,11 +16,10 @@ from anyio import to_thread
 
 from service.requests.keys import Scope
 from service.server.base.settings import Settings
-from service.server.database import keys
 from service.server.process import connections
 from service.server.process.connections import ConnectionLimits, limits_of, raise_descriptors
 from service.server.process.serve import THREADS, http_server
-from tests.service.server_process import serving
+from tests.service.server_process import revoke, serving
 from tests.service.waiting import until
 
 WAIT_S = 20.0
@@ -209,7 +207,7 @@ def test_the_stream_of_a_revoked_key_ends(tmp_path):
         with server.client(revoked) as one, server.client(kept) as two, server.database() as database:
             with one.stream("GET", "/v1/events") as ending, two.stream("GET", "/v1/events") as staying:
                 assert ending.status_code == staying.status_code == 200
-                assert database.transact(partial(keys.revoke, identifier=revoked.partition(".")[0]))
+                assert revoke(database, revoked)
                 assert list(ending.iter_lines()) == []
                 assert not staying.is_closed
             assert one.get("/v1/events").status_code == 401

@@ -1,18 +1,17 @@
 """relit doctor, of a service."""
 
 import sqlite3
-from functools import partial
 
 import pytest
 
 from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
-from service.requests.keys import NewKey, Scope
 from service.server.base.settings import Settings
 from service.server.database import keys, workers
 from service.server.database.engine import connect
 from service.server.database.schema import REVISIONS
 from service.server.jobs.queue import JobQueue, prepare
+from tests.service.server_process import new_key, revoke
 
 
 @pytest.fixture
@@ -27,7 +26,7 @@ def database(data):
     settings = Settings(data=data)
     made = connect(settings.sqlalchemy_url)
     prepare(settings, made)
-    made.transact(partial(keys.insert, wanted=NewKey(project="larch", name="x", scope=Scope.READ)))
+    new_key(made)
     yield made
     made.close()
 
@@ -76,7 +75,7 @@ def wrong(relit, *arguments: object) -> list[str]:
 
 
 def test_no_key_and_jobs_that_wait_for_nobody(relit, data, database, monkeypatch):
-    database.transact(partial(keys.revoke, identifier=keys.listing(database)[0]["id"]))
+    revoke(database, keys.listing(database)[0]["id"])
     (line,) = wrong(relit, "--data", data)
     assert line.startswith("keys: none") and "relit keys create" in line
     monkeypatch.setenv("RELIT_ANONYMOUS", "true")

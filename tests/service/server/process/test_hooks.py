@@ -122,7 +122,7 @@ def test_a_receiver_that_never_answers_well_is_given_up_within_two_days(site, re
     assert site.log(job)[-1] == f"{hook['id']} given up after 14 tries: 404"
     site.send(86_400)
     assert len(receiver.received) == 14
-    site.house.keeper.round()
+    site.house.round()
     assert site.last(hook)["state"] == "given_up"
     site.tidy(DELIVERY_S)
     assert hooks.last_delivery(site.database, hook["id"]) is None
@@ -208,7 +208,7 @@ def test_what_waits_is_bounded_by_age_and_number(site, receiver, monkeypatch):
     receiver.status = 500
     ended = [site.ended() for _ in range(4)]
     site.send()
-    site.house.keeper.round()
+    site.house.round()
     assert hooks.count_waiting(site.database, hook["id"]) == 2
     assert [site.log(job)[-1] for job in ended[:2]] == [
         f"{hook['id']} given up after 1 tries: 500", f"{hook['id']} given up after 0 tries: not tried"]

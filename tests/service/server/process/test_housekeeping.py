@@ -21,16 +21,14 @@ def test_old_jobs_go_with_their_results_and_their_place_in_the_queue(house):
     young = house.job()
     waiting, running = house.job(jobs.QUEUED), house.job(jobs.RUNNING)
     capture, sky = house.capture(), house.capture(ENVIRONMENT)
-    house.keeper.round()
+    house.round()
     assert all(house.results(job).exists() for job in [*old, young])
-    house.now += 0.2 * DAYS * DAY_S
-    house.keeper.round()
+    house.round(0.2 * DAYS * DAY_S)
     left = {row["id"] for row in jobs.latest(house.database, PROJECT, limit=100)}
     assert left == {young, waiting, running}
     assert {path.name for path in house.results(young).parent.iterdir()} == left
     assert house.workflows() == {f"{job}.1" for job in left}
-    house.now += 1000 * DAYS * DAY_S
-    house.keeper.round()
+    house.round(1000 * DAYS * DAY_S)
     assert {row["id"] for row in jobs.latest(house.database, PROJECT, limit=100)} == {waiting, running}
     assert intakes.find(house.database, capture, PROJECT) and intakes.find(house.database, sky, PROJECT)
 
@@ -42,11 +40,10 @@ def test_without_retention_jobs_stay_and_marks_of_removed_ones_do_not(tmp_path):
     for kind in (CAPTURE, ENVIRONMENT):  # without a file, of which no writer is under way
         house.storage.remove(layout.intake(PROJECT, house.capture(kind)))
     marks = [path for path in house.settings.data.glob("removed/**/*") if path.is_file()]
-    house.keeper.round()
+    house.round()
     assert len(marks) == 1 and marks[0].exists()
     os.utime(marks[0], (0, 0))
-    house.now += 100_000 * DAY_S
-    house.keeper.round()
+    house.round(100_000 * DAY_S)
     assert house.results(job).exists() and jobs.find(house.database, job) and not marks[0].exists()
     house.database.close()
 
@@ -54,11 +51,10 @@ def test_without_retention_jobs_stay_and_marks_of_removed_ones_do_not(tmp_path):
 def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
     solved = house.job()
     reader = house.job(jobs.QUEUED, inputs=(solved,), request=ExportJob(kind="export", maps=solved))
-    house.now += 2 * DAYS * DAY_S
-    house.keeper.round()
+    house.round(2 * DAYS * DAY_S)
     assert house.results(solved).exists()
     house.database.transact(lambda connection: jobs.cancel(connection, reader))
-    house.keeper.round()
+    house.round()
     assert not house.results(solved).exists() and jobs.find(house.database, solved) is None
 
 
@@ -72,14 +68,13 @@ def test_uploads_that_nobody_goes_on_with_expire(house):
     with PartFile.open(folder, upload) as part:
         part.append([b"12345"])
     PartFile.open(folder, "up_orphan").close()
-    house.now += 47 * HOUR_S
-    house.keeper.round()
+    house.round(47 * HOUR_S)
     assert uploads.find(house.database, upload, PROJECT) and {path.stem for path in folder.iterdir()} == {upload, "up_orphan"}
     house.now += 2 * HOUR_S
     with PartFile.open(folder, upload):  # a request adds to it
-        house.keeper.round()
+        house.round()
         assert uploads.find(house.database, upload, PROJECT)
-    house.keeper.round()
+    house.round()
     assert uploads.find(house.database, upload, PROJECT) is None and list(folder.iterdir()) == []
     assert uploads.find(house.database, done, PROJECT) and intakes.find(house.database, capture, PROJECT)
 
@@ -95,18 +90,14 @@ def test_tokens_are_remembered_for_a_day_and_lines_of_the_audit_log_for_audit_da
         return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)[0]
 
     ask()
-    house.now += 0.9 * DAY_S
-    house.keeper.round()
+    house.round(0.9 * DAY_S)
     assert ask() == made[0]
-    house.now += 0.2 * DAY_S
-    house.keeper.round()
+    house.round(0.2 * DAY_S)
     assert ask() == made[1]
     house.database.transact(lambda connection: audit.record_operator(connection, PROJECT, "key.create", "key_1"))
-    house.now += 397.5 * DAY_S
-    house.keeper.round()
+    house.round(397.5 * DAY_S)
     assert len(audit.listing(house.database, limit=9)) == 1
-    house.now += 2 * DAY_S
-    house.keeper.round()  # in which the clock jumps
+    house.round(2 * DAY_S)  # in which the clock jumps
     assert len(audit.listing(house.database, limit=9)) == 0
 
 
@@ -120,12 +111,11 @@ def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(ho
     def known() -> set[str]:
         return {row["id"] for row in house.database.rows(sa.select(tables.workers))}
 
-    house.now += 2 * HOUR_S  # as after a database that was away
-    house.keeper.round()
+    house.round(2 * HOUR_S)  # as after a database that was away
     assert known() == {"dead", "alive"}
     house.database.transact(lambda connection: connection.execute(
         tables.workers.update().where(tables.workers.c.id == "alive").values(seen_at=house.now)))
-    house.keeper.round()
+    house.round()
     assert known() == {"alive"}
     assert (locks / "dead.lock").exists() != house.settings.is_sqlite  # on PostgreSQL locks are no files, and this is none of ours
 
@@ -137,11 +127,10 @@ def test_stack_caches_go_with_their_captures_and_what_a_killed_worker_began_goes
     half.mkdir()
     begun = folders[0] / ".stack.abc.npy"
     begun.write_bytes(b"half")
-    house.keeper.round()
+    house.round()
     assert folders[0].exists() and folders[1].exists() and not half.exists() and begun.exists()  # it may be in the making
     house.database.transact(lambda connection: intakes.remove(connection, gone))
-    house.now += UNFINISHED_S + HOUR_S
-    house.keeper.round()
+    house.round(UNFINISHED_S + HOUR_S)
     assert (folders[0] / "stack.npy").exists() and not folders[1].exists() and not begun.exists()
 
 
@@ -154,12 +143,12 @@ def test_beyond_their_limit_the_caches_go_that_were_not_read_for_longest(tmp_pat
     for moment, job in enumerate((in_use, last)):
         house.database.transact(lambda connection, job=job, at=house.now + 100 + moment: connection.execute(
             tables.jobs.update().where(tables.jobs.c.id == job).values(updated_at=at)))
-    house.keeper.round()  # 4000 bytes: two go, those that no job has read
+    house.round()  # 4000 bytes: two go, those that no job has read
     assert [folder.exists() for folder in folders] == [True, True, False, False]
     house.database.transact(lambda connection: connection.execute(
         tables.jobs.update().where(tables.jobs.c.id == in_use).values(updated_at=house.now - 100)))
     unread = house.cache(house.capture())
-    house.keeper.round()  # the oldest is in use, the next is the one that no job has read since it was made
+    house.round()  # the oldest is in use, the next is the one that no job has read since it was made
     assert [folder.exists() for folder in (*folders[:2], unread)] == [True, True, False]
     house.database.close()
 
@@ -187,11 +176,10 @@ def test_what_is_half_removed_or_made_again_of_a_deleted_job_is_removed(house):
     for folder in (half, stray):
         folder.mkdir()
         (folder / "frame.0001.exr").write_bytes(b"frame")
-    house.keeper.round()
+    house.round()
     assert [house.results(job).exists() for job in (deleted, kept, restored)] == [False, True, True]
     assert not half.exists() and stray.exists()
-    house.now += 10 * DAYS * DAY_S
-    house.keeper.round()
+    house.round(10 * DAYS * DAY_S)
     assert stray.exists()
 
 
@@ -203,7 +191,7 @@ def test_one_piece_that_fails_does_not_stop_the_others(house, monkeypatch):
     house.now += 2 * DAYS * DAY_S
     monkeypatch.setattr(type(house.storage), "remove", fail)
     capture = house.cache(new_id(CAPTURE))
-    house.keeper.round()
+    house.round()
     assert not capture.exists() and jobs.find(house.database, old) is None
 
 
@@ -222,8 +210,8 @@ def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypa
     logged = []
     monkeypatch.setattr(housekeeping.logger, "error", lambda event, **fields: logged.append((event, fields["piece"])))
     stale = house.cache(new_id(CAPTURE))
-    house.keeper.round()
-    house.keeper.round()
+    house.round()
+    house.round()
     assert jobs.find(house.database, bad) and jobs.find(house.database, good) is None and not stale.exists()
     assert logged == [("housekeeping failed", bad)]
 
@@ -236,51 +224,46 @@ def jump(house, seconds):
 
 def test_a_clock_that_jumps_removes_nothing_at_once(house):
     job = house.job()
-    house.keeper.round()
+    house.round()
     jump(house, 20 * 365 * DAY_S)
     for hours in (0, 10, 23):
-        house.now += hours * HOUR_S / 2
-        house.keeper.round()
+        house.round(hours * HOUR_S / 2)
         assert house.results(job).is_dir() and jobs.find(house.database, job) is not None
     jump(house, -20 * 365 * DAY_S)  # the operator has seen it
-    house.keeper.round()
-    house.now += 0.9 * DAYS * DAY_S  # as time passes, and nobody touches the clock
-    house.keeper.round()
+    house.round()
+    house.round(0.9 * DAYS * DAY_S)  # as time passes, and nobody touches the clock
     assert house.results(job).is_dir()
-    house.now += 0.1 * DAYS * DAY_S
-    house.keeper.round()
+    house.round(0.1 * DAYS * DAY_S)
     assert not house.results(job).exists() and jobs.find(house.database, job) is None
 
 
 def test_a_clock_that_stays_ahead_is_believed_after_a_day(house):
     job = house.job()
-    house.keeper.round()
+    house.round()
     jump(house, 60 * DAY_S)
-    house.keeper.round()
-    house.now += 0.9 * DAY_S
-    house.keeper.round()
+    house.round()
+    house.round(0.9 * DAY_S)
     assert house.results(job).is_dir()
-    house.now += 0.2 * DAY_S
-    house.keeper.round()
+    house.round(0.2 * DAY_S)
     assert not house.results(job).exists()
 
 
 def test_a_machine_that_starts_with_another_year_removes_nothing_at_once(house):
     """The process that saw the time before is gone."""
     job = house.job()
-    house.keeper.round()
+    house.round()
     for seconds in (9 * 365 * DAY_S, 0.0):
         house.now += seconds
         house.keeper = Housekeeper(house.settings, house.database, house.storage, house.queue, clock=lambda: house.now,
                                    monotonic=lambda: house.now)
-        house.keeper.round()
+        house.round()
         assert house.results(job).is_dir()
 
 
 def test_a_clock_that_is_set_right_by_minutes_is_no_jump(house):
     job = house.job()
-    house.keeper.round()
+    house.round()
     house.now += 1.01 * DAYS * DAY_S
     jump(house, -600)
-    house.keeper.round()
+    house.round()
     assert not house.results(job).exists()

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.process.backup import CONTENTS, backup, restore, save
@@ -14,7 +13,6 @@ from service.server.storage.bucket import Bucket
 from stage.errors import StorageError
 from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
 from tests.service.server.jobs.harness import PROJECT, digests, harness
-from tests.service.server_process import SABOTAGE
 
 MAPS, FRAME = (f"projects/larch/jobs/job_{'0' * 20}/{name}" for name in ("maps.exr", "frame.0001.exr"))
 PIECE = "uploads/up_x/0"
@@ -138,9 +136,8 @@ def test_a_job_that_ran_is_finished_by_the_restored_service_in_another_store(tmp
     roots = str(undisturbed.capture.parent)
     first, other = ((tmp_path / name).as_uri() for name in ("store", "other"))
     with harness(tmp_path / "first", roots=roots, storage_url=first) as made:
-        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backups
-        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
-                           undisturbed.frames, chunk_frames=6)
+        made.start("slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backups
+        job = made.begin(undisturbed, chunk_frames=6)
         made.until(lambda: made.row(job)["finished_steps"], "the first frames sent")
         saved = backup(made.settings, tmp_path / "saved", copy_objects=True)
         named = backup(made.settings, tmp_path / "named")
