@@ -13,7 +13,7 @@ import numpy as np
 
 from service import __version__
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
-from service.calibrate.solvers.card_faults import card_faults, check_dark, mixed_colours
+from service.calibrate.solvers.card_faults import BRIGHT, brightness, card_faults, check_alike, check_dark, mixed_colours
 from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation
 from service.errors import RequestError
 from service.reporting.progress import Progress
@@ -59,6 +59,7 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
     timings.stage("images", len(request.images))
     mean = mean_image(request.images, capture, progress=timings.advance)
     check_dark(mean.pixels, mean.noise, capture)
+    check_alike(request.images, mean.levels, brightness(capture))
     timings.close()
     return _write(DARK_FILE, "dark", request, capture, manifest_path, mean.pixels.astype(np.float32), {
         "images": mean.images, "noise": float(f"{mean.noise:.4g}"), "mean": digits(mean.pixels.mean(axis=(0, 1)))})
@@ -73,6 +74,7 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
     white_dark = None
     if request.dark_images:
         white_dark = mean_image(request.dark_images, capture, progress=lambda done: timings.advance(white.images + done))
+        check_alike(request.dark_images, white_dark.levels, float(np.percentile(white.pixels, BRIGHT)))
     flat = make_flat(white, white_dark, capture)
     timings.close()
     mask = capture.mask()
@@ -148,6 +150,7 @@ class MeanImage(NamedTuple):
     """The root mean square of the difference of an image from the mean, over all pixels; 0 for one image."""
     images: int
     """The count of images."""
+    levels: np.ndarray  # [images] mean reading of each, linear
 
 
 def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
@@ -160,7 +163,7 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     manifest = capture.manifest
     mask = capture.mask() if refuse_saturated else None
     total = np.zeros((capture.camera.height, capture.camera.width, 3))
-    squares = 0.0
+    squares, levels = 0.0, []
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
@@ -173,11 +176,12 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
         linear = linearise(recorded, manifest.color_space).astype(np.float64)
         total += linear
         squares += float((linear**2).mean())
+        levels.append(float(linear.mean()))
         if progress is not None:
             progress(index + 1)
     mean = total / len(paths)
     variance = max(squares / len(paths) - float((mean**2).mean()), 0.0)
-    return MeanImage(mean, variance**0.5, len(paths))
+    return MeanImage(mean, variance**0.5, len(paths), np.array(levels))
 
 
 def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:

@@ -117,6 +117,11 @@ def test_a_dark_image_with_light_in_it_is_refused(relit, tmp_path):
     assert (folder / "capture.json").read_bytes() == before
     covered = [write_exr(tmp_path / f"{number}.exr", np.abs(RNG.normal(0, 1e-4, (32, 32, 3)))) for number in range(3)]
     relit.done("calibrate", "dark", folder, *covered)
+    said = relit.refused("calibrate", "dark", folder, covered[0], lit, *covered[1:])  # its light was a part of the mean, and of its noise
+    assert "lit.exr: is brighter than" in said and "cover the lens in all dark images" in said
+    card = write_exr(tmp_path / "card.exr", np.full((32, 32, 3), 0.5))
+    assert "lit.exr" in relit.refused("calibrate", "flat-field", folder, card, "--dark", covered[0], "--dark", lit)
+    relit.done("calibrate", "flat-field", folder, card, "--dark", covered[0], "--dark", covered[1])
 
 
 V, U = np.mgrid[-0.74:0.74:60j, -0.99:0.99:80j]
