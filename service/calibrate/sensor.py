@@ -14,7 +14,7 @@ import numpy as np
 from service import __version__
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
 from service.calibrate.solvers.card_faults import BRIGHT, brightness, card_faults, check_alike, check_dark, mixed_colours
-from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation
+from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation, clipped_level
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest, WhiteBalanceRequest
@@ -169,8 +169,7 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
         if mask is not None:
-            limit = saturation_limit(manifest, path)
-            count = int((np.any(recorded >= limit, axis=-1) & mask).sum())
+            count, limit = _saturated(recorded[mask], saturation_limit(manifest, path))
             if count:
                 raise ImageError(f"{path}: {count} pixels are at or above the saturation of {limit:g}: shorten the exposure")
         linear = linearise(recorded, manifest.color_space).astype(np.float64)
@@ -182,6 +181,13 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     mean = total / len(paths)
     variance = max(squares / len(paths) - float((mean**2).mean()), 0.0)
     return MeanImage(mean, variance**0.5, len(paths), np.array(levels))
+
+
+def _saturated(readings: np.ndarray, limit: float) -> tuple[int, float]:
+    """Return how many of the readings of a card, [readings, 3] as recorded, are saturated, and from which value on: the limit, or else one
+    that they show."""
+    level = limit if (readings >= limit).any() else clipped_level(readings)
+    return int((readings >= level).any(axis=-1).sum()), level
 
 
 def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:
@@ -238,10 +244,10 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         raise RequestError(f"--sensor-colors: is about camera raw files, and {request.images[0]} is none")
     timings.stage("images", len(request.images))
     for path in request.images:
-        over = int((region.of(images.read_pixels(path)) >= saturation_limit(capture.manifest, path)).any(axis=-1).sum())
+        over, limit = _saturated(region.of(images.read_pixels(path)).reshape(-1, 3), saturation_limit(capture.manifest, path))
         if over:
-            raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region without "
-                                   "them")
+            raise CalibrationError(f"{path}: {over} pixels of the card are saturated, from {limit:g} on: shorten the exposure, or choose "
+                                   "a --region without them")
     card = region.of(mean_image(request.images, capture, progress=timings.advance).pixels)
     if capture.manifest.dark is not None:
         card = card - region.of(linearise(capture.recorded(capture.manifest.dark), capture.manifest.color_space))

@@ -101,6 +101,21 @@ def test_a_clipped_white_card_is_refused_where_the_manifest_says_no_saturation(r
     relit.done("calibrate", "flat-field", folder, write_exr(folder.parent / "card.exr", levels / 100))
 
 
+@pytest.mark.parametrize("kind", ["flat-field", "white-balance"])
+def test_a_card_that_is_clipped_below_full_scale_is_refused(relit, tmp_path, kind):
+    """Converters of camera raw clip at other values than the largest, and EXR has none: half of the card was read as its middle, and red
+    was 8 % too weak. One of several images is enough; with less light the card is right, and even light in eight bits is no clipping."""
+    folder = write_capture(tmp_path / "cap", make_scene(64, 3))
+    v, u = np.mgrid[-0.7:0.7:64j, -0.7:0.7:64j]
+    card = (1 - 0.35 * (u**2 + v**2))[..., None] * (1.1, 0.98, 0.85) + RNG.normal(0, 0.003, (64, 64, 3))
+    clipped = write_exr(tmp_path / "clipped.exr", np.minimum(card, 0.9))
+    right = write_exr(tmp_path / "right.exr", 0.7 * card)
+    assert "clipped.exr" in relit.refused("calibrate", kind, folder, right, clipped)
+    relit.done("calibrate", kind, folder, right)
+    even = np.rint(200 + RNG.normal(0, 0.3, (64, 64, 3))).astype(np.uint8)
+    relit.done("calibrate", kind, folder, write_image(tmp_path / "even.png", even))
+
+
 def test_a_card_above_the_saturation_of_the_manifest_gives_no_white_balance(relit, folder):
     """Fourteen bits in sixteen end at a quarter of full scale, where every colour becomes grey."""
     edit_manifest(folder, saturation=0.249)
