@@ -33,7 +33,7 @@ from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_poi
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, dark_side, fit_brightness, fit_direction
-from service.light_estimation.semi_calibrated import check_directions, fit_intensities, part_uncertainty
+from service.light_estimation.semi_calibrated import Intensities, check_directions, fit_intensities, part_uncertainty
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
 from stage.capture.light import DistantLight, PointLight
@@ -45,6 +45,8 @@ ANALYSER_GAIN = 2.0
 """Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""
 READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
+ALIEN, LEAST_ALIEN = 5.0, 0.02
+"""Residual of a light, over the median of all and relative to readings, from which it contradicts the others; 2 where none does."""
 UNSURE = 0.05
 """Median uncertainty of the brightness of lights, relative, from which the object is said to be none to measure them on."""
 WIDE = 2.0
@@ -265,6 +267,14 @@ def _scaled(results: Sequence[MeasuredLight], albedo: tuple[float, float, float]
     return scaled
 
 
+def _contradicting(found: Intensities) -> np.ndarray:
+    """Return which lights contradict the others, [lights] bool: beside readings of their own, and beside those of all (dim lights have
+    noise)."""
+    left = found.residual.max(axis=1)
+    far = [each > ALIEN * np.nanmedian(each) for each in (left, left * found.irradiance.max(axis=1))]
+    return np.asarray((left > LEAST_ALIEN) & far[0] & far[1])
+
+
 def intensity(request: IntensityRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1."""
     captures, timings = open_captures(request, progress)
@@ -295,21 +305,28 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
         uncertainty = part_uncertainty(readings, usable, directions, found.irradiance)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
+    alien = _contradicting(found)
+    uncertainty[alien] = 1.0
     results: list[MeasuredLight | CalibrationError] = []
-    for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, uncertainty, strict=True):
+    for lit, rgb, residual, sigma, other in zip(captures.lit, found.irradiance, found.residual, uncertainty, alien, strict=True):
         assert isinstance(lit.light, DistantLight)
         if np.isnan(rgb).any():
             results.append(CalibrationError("too few pixels of the object are lit by this light to tell its brightness"))
             continue
         flags = ["behind: seen at grazing angles only"] if lit.light.direction[2] < BEHIND_Z else []
+        flags += ["contradicts the others: check its direction and image"] if other else []
         entry = {"irradiance": digits(rgb), "uncertainty": digits(sigma), "residual": digits(residual), "flags": flags}
         row = (three_numbers(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
         results.append(MeasuredLight(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
     timings.close()
     measured = leave_out_failures(captures, results, drop_failed=request.drop_failed)
+    wrong = ", ".join(lit.frame.image for lit, other in zip(captures.lit, alien, strict=True) if other)
     unsure = float(np.median([result.doubt for result in measured if result.light is not None]))
-    warnings = () if unsure < UNSURE else (
+    warnings: tuple[str, ...] = () if unsure < UNSURE else (
         f"lights: parts of the object ask for lights that differ by {100 * unsure:.0f} %, as where it is glossy, rough, velvet or metal, "
         "or in shadow: measure them on a grey ball (relit calibrate grey-ball)",)
+    if wrong:
+        warnings = (*warnings, f"frames: {wrong}: readings contradict those under the other lights, as where an image is that of another "
+                               "light, or clipped, or light.direction is wrong: their strength is not known")
     return write_lights("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
                         summary={"pixels": found.pixels}, relative=True, warnings=warnings)

@@ -13,8 +13,8 @@ import numpy as np
 
 from service import __version__
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
-from service.calibrate.solvers.card_faults import card_faults, check_dark, mixed_colours
-from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation
+from service.calibrate.solvers.card_faults import BRIGHT, brightness, card_faults, check_alike, check_dark, mixed_colours
+from service.calibrate.solvers.saturation_level import ReadingHistogram, capture_saturation, clipped_level
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest, WhiteBalanceRequest
@@ -59,6 +59,7 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
     timings.stage("images", len(request.images))
     mean = mean_image(request.images, capture, progress=timings.advance)
     check_dark(mean.pixels, mean.noise, capture)
+    check_alike(request.images, mean.levels, brightness(capture))
     timings.close()
     return _write(DARK_FILE, "dark", request, capture, manifest_path, mean.pixels.astype(np.float32), {
         "images": mean.images, "noise": float(f"{mean.noise:.4g}"), "mean": digits(mean.pixels.mean(axis=(0, 1)))})
@@ -73,6 +74,7 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
     white_dark = None
     if request.dark_images:
         white_dark = mean_image(request.dark_images, capture, progress=lambda done: timings.advance(white.images + done))
+        check_alike(request.dark_images, white_dark.levels, float(np.percentile(white.pixels, BRIGHT)))
     flat = make_flat(white, white_dark, capture)
     timings.close()
     mask = capture.mask()
@@ -148,6 +150,7 @@ class MeanImage(NamedTuple):
     """The root mean square of the difference of an image from the mean, over all pixels; 0 for one image."""
     images: int
     """The count of images."""
+    levels: np.ndarray  # [images] mean reading of each, linear
 
 
 def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
@@ -160,24 +163,31 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     manifest = capture.manifest
     mask = capture.mask() if refuse_saturated else None
     total = np.zeros((capture.camera.height, capture.camera.width, 3))
-    squares = 0.0
+    squares, levels = 0.0, []
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
         check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
         if mask is not None:
-            limit = saturation_limit(manifest, path)
-            count = int((np.any(recorded >= limit, axis=-1) & mask).sum())
+            count, limit = _saturated(recorded[mask], saturation_limit(manifest, path))
             if count:
                 raise ImageError(f"{path}: {count} pixels are at or above the saturation of {limit:g}: shorten the exposure")
         linear = linearise(recorded, manifest.color_space).astype(np.float64)
         total += linear
         squares += float((linear**2).mean())
+        levels.append(float(linear.mean()))
         if progress is not None:
             progress(index + 1)
     mean = total / len(paths)
     variance = max(squares / len(paths) - float((mean**2).mean()), 0.0)
-    return MeanImage(mean, variance**0.5, len(paths))
+    return MeanImage(mean, variance**0.5, len(paths), np.array(levels))
+
+
+def _saturated(readings: np.ndarray, limit: float) -> tuple[int, float]:
+    """Return how many of the readings of a card, [readings, 3] as recorded, are saturated, and from which value on: the limit, or else one
+    that they show."""
+    level = limit if (readings >= limit).any() else clipped_level(readings)
+    return int((readings >= level).any(axis=-1).sum()), level
 
 
 def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:
@@ -231,10 +241,10 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         raise RequestError(f"--sensor-colors: is about camera raw files, and {request.images[0]} is none")
     timings.stage("images", len(request.images))
     for path in request.images:
-        over = int((region.of(images.read_pixels(path)) >= saturation_limit(capture.manifest, path)).any(axis=-1).sum())
+        over, limit = _saturated(region.of(images.read_pixels(path)).reshape(-1, 3), saturation_limit(capture.manifest, path))
         if over:
-            raise CalibrationError(f"{path}: {over} pixels of the card are saturated: shorten the exposure, or choose a --region without "
-                                   "them")
+            raise CalibrationError(f"{path}: {over} pixels of the card are saturated, from {limit:g} on: shorten the exposure, or choose "
+                                   "a --region without them")
     card = region.of(mean_image(request.images, capture, progress=timings.advance).pixels)
     if capture.manifest.dark is not None:
         card = card - region.of(linearise(capture.recorded(capture.manifest.dark), capture.manifest.color_space))

@@ -60,6 +60,8 @@ DETERMINED = 0.5
 """Standard deviation of ranges, as a part of their errors without a calibration, above which more distances are needed."""
 MOST_SCALED = 0.05
 """Part by which measured distances are wrong beside declared ones beyond which no clock of a camera makes them; crystals keep 10⁻⁴."""
+APART = 0.1
+"""Part of the spread of distances that does not follow the temperature, below which drift and scale are one."""
 
 
 class TofCalibrationResult(NamedTuple):
@@ -91,7 +93,8 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
     plain = _range_errors(plan, captures, None, device, timings)
-    found = _fit_line(plan, captures, plain) if kinds == {True} else _fit_wiggling(plan, captures, plain, device, timings)
+    pulsed = kinds == {True}
+    found = _fit_line(plan, captures, plain) if pulsed else _fit_wiggling(plan, captures, plain, device, timings)
     calibration = TofCalibration.model_validate({
         **found.known, "sigma_m": None if found.sigma_m is None else float(f"{found.sigma_m:.3g}")})
     after = _range_errors(plan, captures, calibration, device, timings, told=found.warnings)
@@ -100,7 +103,8 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
         drift, level = fit_temperature(after[used], warm[used])
         after = after - level - drift.metres_per_c * (warm - drift.reference_c)
-        sigma = None if found.sigma_m is None else float(f"{np.hypot(found.sigma_m, after[used].std(ddof=1)):.3g}")
+        own = 0.0 if pulsed else after[used].std(ddof=1)  # the line was fitted beside the drift
+        sigma = None if found.sigma_m is None else float(f"{np.hypot(found.sigma_m, own):.3g}")
         calibration = calibration.model_copy(update={"temperature": drift, "offset_m": calibration.offset_m + level, "sigma_m": sigma})
     write_calibration(calibration, request.out)
     report = write_report("tof", request, request.out.parent, {
@@ -154,33 +158,49 @@ class _Found(NamedTuple):
     known: dict[str, Any]
     """Entries of the calibration."""
     sigma_m: float | None
-    """The standard deviation of ranges that it leaves open, before a drift with temperature; None: the steps are too few to tell."""
+    """The standard deviation of ranges that it leaves open; of harmonics before a drift with temperature. None: the steps are too few to
+    tell."""
     left_out: list[int]
     """The steps whose distances contradict the others."""
     warnings: tuple[str, ...]
 
 
 def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Found:
-    """Fit scale and offset to the median half paths of the steps."""
+    """Fit scale and offset to the median half paths of the steps, beside a drift with their temperatures."""
     true = np.array([float(np.median(_true_half_path(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
     measured = true + errors
+    warm = np.array([step.temperature_c if plan.has_drift else 0.0 for step in plan.steps], np.float64)
 
     def off(steps: list[int]) -> Fit:
-        return fit_steps([np.array([[measured[step], 1.0]]) for step in steps], [true[step:step + 1] for step in steps])
+        return fit_steps([np.array([[measured[step], 1.0, warm[step]]]) for step in steps], [true[step:step + 1] for step in steps])
+
+    def beside(values: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Return values without what follows another quantity, about their mean."""
+        apart = other - other.mean()
+        return np.asarray(values - apart * (apart @ values) / max(apart @ apart, 1e-300))
 
     kept, left_out, warnings = _consistent(plan, errors, range(len(captures)), lambda steps: -off(steps).scatter)
-    scale, offset = fit_line(measured[kept], true[kept])
+    ranges, depths = (beside(values[kept], warm[kept]) for values in (measured, true))
+    if ranges.std() < APART * measured[kept].std():
+        raise RequestError("steps: temperature_c rises or falls with depth_m, so that the drift cannot be told from the scale: measure "
+                           "some distances again at another temperature")
+    scale, offset = fit_line(ranges, depths)
     if abs(scale - 1) > MOST_SCALED:
         raise RequestError(f"steps: depth_m grows by {scale:.3g} m for each metre of the measured ranges: check depth_m, its unit, the "
                            "order of the captures, and their bin_s")
-    middle, spread = float(measured[kept].mean()), float(measured[kept].std())
+    middle, spread = float(measured[kept].mean()), float(ranges.std())
     entries = {"scale": scale, "offset_m": offset}
-    if len(kept) < 3:
+    unknowns = 3 if plan.has_drift else 2
+    if len(kept) <= unknowns:
         return _Found(entries, None, left_out, warnings)
-    left = true[kept] - scale * measured[kept] + offset
-    sigma = float(np.sqrt(np.sum(left**2) / (len(kept) - 2)))  # of any other distance, which a line through a bend misses by as much
+    left = depths - scale * ranges + offset
+    # that of any other distance, which a line through a bend misses by as much
+    sigma = float(np.sqrt(np.sum(left**2) / (len(kept) - unknowns)))
     entries |= {"middle_m": float(f"{middle:.4g}"), "scale_sigma": float(f"{sigma / spread / np.sqrt(len(kept)):.3g}")}
+    if plan.has_drift:  # what the drift leaves open at temperatures as far apart as those of the sweep
+        own = max(float(beside(warm[kept], measured[kept]).std()), 1e-300)
+        sigma *= float(np.hypot(1, warm[kept].std() / own / np.sqrt(len(kept))))
     return _Found(entries, sigma, left_out, warnings)
 
 

@@ -1,6 +1,7 @@
 """Import of images of two cameras that look at one scene at the same moments, with an OpenCV calibration of the pair."""
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
     shown = [_images(side) for side in (left, right)]
     if len(shown[0]) != len(shown[1]):
         raise ManifestError(f"{right}: has {len(shown[1])} images and {left} {len(shown[0])}: each moment needs one of either camera")
+    _check_numbers(*shown)
     folder = Path(os.path.commonpath([path.parent for path in (shown[0][0], shown[1][0])]))
     if destination is None and folder not in (left.resolve().parent, left.resolve()):
         raise ManifestError(f"{left}: does not lie beside {right}: name a folder for the capture")
@@ -50,6 +52,16 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
         ("frames", f"{len(names[0])} pairs in their order, {names[0][0]} with {names[1][0]} first"),
         ("second", f"{np.linalg.norm(pose[:3, 3]):.4g} m from the first camera: {x:.4g} right, {y:.4g} up, {z:.4g} back"),
     ))
+
+
+def _check_numbers(left: list[Path], right: list[Path]) -> None:
+    """Refuse pairs whose numbers differ where most numbers are in both folders: another image lacks in either."""
+    numbers = [[int((re.findall(r"\d+", path.stem) or ["0"])[-1]) for path in side] for side in (left, right)]
+    away = [one - other for one, other in zip(*numbers, strict=True)]
+    if len(set(away)) > 1 and 2 * len(set(numbers[0]) & set(numbers[1])) > len(left):
+        odd = next(index for index, each in enumerate(away) if each)
+        raise ManifestError(f"{left[odd]}: would be paired with {right[odd].name}, whose number is another, as where an image lacks: leave "
+                            "the images without a partner out of both folders")
 
 
 def _images(source: Path) -> list[Path]:

@@ -1,6 +1,9 @@
 """What images of a covered lens and of cards show that they should not: light in the dark, light that falls across a card, and other things
 than the card."""
 
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
 import numpy as np
 
 from kernels.photometric.model.samples import evenly
@@ -12,6 +15,8 @@ FRAMES = 8
 """Frames that a dark image is compared with."""
 BELOW, BELOW_SIGMAS = 0.01, 5.0
 """By how much a reading is darker than the dark image: as a part of the brighter readings, and in standard deviations of an image."""
+BRIGHT = 95.0
+"""Percentile of the readings that stands for the brighter ones."""
 MOST_BELOW = 0.02
 """Part of the readings that may be darker."""
 CELLS = 48
@@ -28,14 +33,37 @@ def check_dark(dark: np.ndarray, noise: float, capture: Capture) -> None:
     """Refuse a dark image, [rows, cols, 3] linear, that frames of the capture are darker than: it has light, or another exposure.
     `noise`: standard deviation of one image. Raises CalibrationError; it names the frame."""
     mask = capture.mask()
-    names = [frame.image for frame in capture.manifest.frames if not frame.image.endswith(".npy")]
-    for number in evenly(len(names), FRAMES):
-        read = linearise(capture.recorded(names[number]), capture.manifest.color_space)[mask]
-        least = max(BELOW * float(np.percentile(read, 95)), BELOW_SIGMAS * noise)
+    for path, recorded in _frames(capture):
+        read = recorded[mask]
+        least = max(BELOW * float(np.percentile(read, BRIGHT)), BELOW_SIGMAS * noise)
         below = float((read < dark[mask] - least).mean())
         if below > MOST_BELOW:
-            raise CalibrationError(f"{capture.file(names[number])}: {100 * below:.0f} % of its readings are darker than the dark image: "
+            raise CalibrationError(f"{path}: {100 * below:.0f} % of its readings are darker than the dark image: "
                                    "cover the lens, and take it at the exposure of the frames")
+
+
+def _frames(capture: Capture) -> Iterator[tuple[Path, np.ndarray]]:
+    """Yield the files of some frames of a capture and their linear readings, [rows, cols, 3]."""
+    names = [frame.image for frame in capture.manifest.frames if not frame.image.endswith(".npy")]
+    for number in evenly(len(names), FRAMES):
+        yield capture.file(names[number]), linearise(capture.recorded(names[number]), capture.manifest.color_space)
+
+
+def brightness(capture: Capture) -> float:
+    """Return the brighter readings of the brightest of some frames of a capture, linear."""
+    mask = capture.mask()
+    return max((float(np.percentile(read[mask], BRIGHT)) for _, read in _frames(capture)), default=np.inf)
+
+
+def check_alike(paths: Sequence[Path], levels: np.ndarray, light: float) -> None:
+    """Refuse dark images of which some have light in them and others none, which the mean of all hides in its noise.
+    `levels`: [images] the mean reading of each, linear. `light`: the brighter readings of what is corrected by them. Raises
+    CalibrationError; it names the image."""
+    over = float(levels.max() - levels.min())
+    if over > BELOW * light:
+        raise CalibrationError(f"{paths[int(levels.argmax())]}: is brighter than {paths[int(levels.argmin())].name} by "
+                               f"{100 * over / light:.1f} % of the light of the frames: cover the lens in all dark images, and take them "
+                               "at one exposure")
 
 
 def card_faults(card: np.ndarray, mask: np.ndarray) -> tuple[str, ...]:

@@ -24,6 +24,9 @@ EXCESS = 3.0
 """The least ratio of the readings at the level to the mean of the two bins below, because a smooth histogram falls towards its end."""
 HOT, HOT_PART = 0.02, 0.005
 """The most readings above the level, as parts of those at it and of all: hot pixels read more than any light does."""
+LEAST_VALUES = 16
+"""Values of a channel from which one image of a card tells that it is clipped: an even card has four of eight bits, and most readings share
+the largest."""
 
 
 class ChannelSaturation(NamedTuple):
@@ -68,11 +71,28 @@ class ReadingHistogram:
         least = int(np.ceil(code * (1 - BIN)))
         return ChannelSaturation(self.peak * code / (CODES - 1) * (1 - BIN), int(at_or_above[least]))
 
+    @property
+    def values(self) -> int:
+        """Return how many values were read."""
+        return int(np.count_nonzero(self._counts))
+
     def _below(self, code: int) -> float:
         """Return the mean count of readings in the two bins below a value."""
         occupied = np.flatnonzero(self._counts[:code])[-BELOW:]
         width = max(BIN * code, float(code - occupied[0]) if len(occupied) == BELOW else code)
         return float(self._counts[max(int(code - 2 * width), 0):code].sum()) / 2
+
+
+def clipped_level(readings: np.ndarray) -> float:
+    """Return the level at and above which the readings of one image of a card, [readings, 3] as recorded, are clipped; infinity where
+    none are, or where no channel has values enough to tell."""
+    histograms = [ReadingHistogram(float(channel.max(initial=0.0))) for channel in readings.T]
+    for histogram, channel in zip(histograms, readings.T, strict=True):
+        histogram.add(channel)
+    if max(histogram.values for histogram in histograms) < LEAST_VALUES:
+        return np.inf
+    found = [histogram.saturation().level for histogram in histograms if histogram.values == 1 or histogram.values >= LEAST_VALUES]
+    return min((level for level in found if level is not None), default=np.inf)
 
 
 def capture_saturation(channels: list[ChannelSaturation]) -> float:

@@ -232,6 +232,25 @@ def test_intensity_from_the_object_itself(relit, tmp_path):
     refused(relit("calibrate", "intensity", other), "three/capture.json: frames: 3 distant lights: brightness")
 
 
+def test_a_light_that_contradicts_the_others_has_no_strength_that_is_sure(relit, tmp_path):
+    """The last frame shows the first light once more: such lights were off by up to 80 %, five times their uncertainty. A lamp of a quarter
+    of the strength of the others is no contradiction; noise is half a percent of the brightest reading."""
+    scene = make_scene(32, 12)
+    folder = write_capture(tmp_path / "cap", scene)
+    names = [frame.image for frame in Capture.open(folder).manifest.frames]
+    random = np.random.default_rng(0)
+    for name in names:
+        read = Capture.open(folder).recorded(name) * (0.25 if name == names[5] else 1)
+        write_exr(folder / name, np.abs(read + random.normal(0, 0.005 * read.max(), read.shape)))
+    relit.done("calibrate", "intensity", folder)
+    assert not any("contradict" in words for light in report_of(folder, "intensity")["lights"] for words in light["flags"])
+    write_exr(folder / names[-1], Capture.open(folder).recorded(names[0]))
+    outcome = relit("calibrate", "intensity", folder)
+    assert outcome.code == 0 and f"frames: {names[-1]}: readings contradict those under the other lights" in outcome.out
+    light = report_of(folder, "intensity")["lights"][-1]
+    assert light["uncertainty"] == [1, 1, 1] and "check its direction and image" in light["flags"][-1]
+
+
 def test_dark_and_flat_are_named_by_the_manifest_and_used(relit, tmp_path):
     scene = make_scene(16, 4)
     folder = write_capture(tmp_path / "cap", scene)

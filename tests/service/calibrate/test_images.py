@@ -101,6 +101,21 @@ def test_a_clipped_white_card_is_refused_where_the_manifest_says_no_saturation(r
     relit.done("calibrate", "flat-field", folder, write_exr(folder.parent / "card.exr", levels / 100))
 
 
+@pytest.mark.parametrize("kind", ["flat-field", "white-balance"])
+def test_a_card_that_is_clipped_below_full_scale_is_refused(relit, tmp_path, kind):
+    """Converters of camera raw clip at other values than the largest, and EXR has none: half of the card was read as its middle, and red
+    was 8 % too weak. One of several images is enough; with less light the card is right, and even light in eight bits is no clipping."""
+    folder = write_capture(tmp_path / "cap", make_scene(64, 3))
+    v, u = np.mgrid[-0.7:0.7:64j, -0.7:0.7:64j]
+    card = (1 - 0.35 * (u**2 + v**2))[..., None] * (1.1, 0.98, 0.85) + RNG.normal(0, 0.003, (64, 64, 3))
+    clipped = write_exr(tmp_path / "clipped.exr", np.minimum(card, 0.9))
+    right = write_exr(tmp_path / "right.exr", 0.7 * card)
+    assert "clipped.exr" in relit.refused("calibrate", kind, folder, right, clipped)
+    relit.done("calibrate", kind, folder, right)
+    even = np.rint(200 + RNG.normal(0, 0.3, (64, 64, 3))).astype(np.uint8)
+    relit.done("calibrate", kind, folder, write_image(tmp_path / "even.png", even))
+
+
 def test_a_card_above_the_saturation_of_the_manifest_gives_no_white_balance(relit, folder):
     """Fourteen bits in sixteen end at a quarter of full scale, where every colour becomes grey."""
     edit_manifest(folder, saturation=0.249)
@@ -117,6 +132,11 @@ def test_a_dark_image_with_light_in_it_is_refused(relit, tmp_path):
     assert (folder / "capture.json").read_bytes() == before
     covered = [write_exr(tmp_path / f"{number}.exr", np.abs(RNG.normal(0, 1e-4, (32, 32, 3)))) for number in range(3)]
     relit.done("calibrate", "dark", folder, *covered)
+    said = relit.refused("calibrate", "dark", folder, covered[0], lit, *covered[1:])  # its light was a part of the mean, and of its noise
+    assert "lit.exr: is brighter than" in said and "cover the lens in all dark images" in said
+    card = write_exr(tmp_path / "card.exr", np.full((32, 32, 3), 0.5))
+    assert "lit.exr" in relit.refused("calibrate", "flat-field", folder, card, "--dark", covered[0], "--dark", lit)
+    relit.done("calibrate", "flat-field", folder, card, "--dark", covered[0], "--dark", covered[1])
 
 
 V, U = np.mgrid[-0.74:0.74:60j, -0.99:0.99:80j]

@@ -276,6 +276,7 @@ def test_the_second_camera_may_have_images_of_another_size(relit, tmp_path):
 
 @pytest.mark.parametrize(("left", "right", "message"), [
     (("a/0.png", "a/1.png"), ("b/0.png",), "has 1 images and"), (("c/a/0.png",), ("b/0.png",), "does not lie beside"),
+    (("a/0.png", "a/1.png", "a/3.png", "a/4.png"), ("b/0.png", "b/1.png", "b/2.png", "b/4.png"), "a/3.png: would be paired with 2.png"),
     (("a/0.png",), ("b/0.txt",), "holds no images"), (("a/0.png",), ("a/1.png",), "is named as the left and as the right camera")])
 def test_pairs_that_are_none(relit, tmp_path, left, right, message):
     for name in (*left, *right):
@@ -285,6 +286,16 @@ def test_pairs_that_are_none(relit, tmp_path, left, right, message):
     before = files_in(tmp_path)
     relit("import", "stereo", (tmp_path / left[0]).parent, (tmp_path / right[0]).parent, "--calibration", rig).refused(message)
     assert files_in(tmp_path) == before
+
+
+def test_pairs_may_be_numbered_each_in_its_own_way(relit, tmp_path):
+    """From 0 and from 1 on, or by a clock."""
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV, pose=stereo.POSE)
+    for case, right in (("shifted", (1, 2, 3, 4)), ("clock", (100, 203, 298, 401))):
+        for folder, numbers in (("a", range(4)), ("b", right)):
+            for number in numbers:
+                write_image(tmp_path / case / folder / f"{number}.png", np.zeros((stereo.CAMERA.height, stereo.CAMERA.width), np.uint8))
+        relit("import", "stereo", tmp_path / case / "a", tmp_path / case / "b", "--calibration", rig, "--unit-m", "0.001").well()
 
 
 @pytest.mark.parametrize("unit", ["0.001", "1e-9"], ids=["no translation", "a wrong unit"])
