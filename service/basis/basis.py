@@ -111,10 +111,11 @@ def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: 
                   "truncation": numbers(_relative(tail, whole.sum())), "truncation_rgb": numbers(basis.truncation),
                   "key_lights": KEY_LIGHTS, "key_lights_relative_rms": None if key_lights is None else numbers(key_lights),
                   "pixels": source.pixels},
-        "provenance": source.provenance,
+        "warnings": source.warnings, "provenance": source.provenance,
     })
     timings.close()
-    return BasisResult(request.out, facts, BasisKind.SVD, count, source.pixels, lights, 0, source.near, relative, None, key_lights)
+    return BasisResult(request.out, facts, BasisKind.SVD, count, source.pixels, lights, 0, source.near, relative, None, source.warnings,
+                       key_lights)
 
 
 def _key_light_error(source: BasisCapture, basis: Basis, products: np.ndarray) -> float | None:
@@ -206,7 +207,7 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
     facts = _write_facts(request, source, model, quantization, {name: numbers(value) for name, value in error.items()})
     timings.close()
     return BasisResult(request.out, facts, kind, terms, source.pixels, lights, stack.light_count - lights, source.near,
-                        float(error["relative_rms"]), float(error["levels_rms"]), None)
+                        float(error["relative_rms"]), float(error["levels_rms"]), source.warnings, None)
 
 
 def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Model:
@@ -251,5 +252,5 @@ def _write_facts(request: BasisRequest, source: BasisCapture, model: Model, quan
         "convention": f"display values, as under one white light of irradiance 1 times exposure; percentile {WHITE_PERCENTILE} is white",
         "exposure": numbers(model.display.exposure), "step": numbers(quantization.step), "zero": quantization.zero.tolist(),
         "lights": source.described_lights(model.display.front), "lights_left_out": [source.stack.frames[i] for i in behind],
-        "error": {**error, "pixels": source.pixels}, "provenance": source.provenance,
+        "error": {**error, "pixels": source.pixels}, "warnings": source.warnings, "provenance": source.provenance,
     })

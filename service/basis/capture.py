@@ -13,6 +13,8 @@ from kernels import packs
 from kernels.packs import Band
 from kernels.relight.basis.rti import encode
 from service.errors import RequestError
+from service.relight.clipping import Clipping
+from service.relight.findings import LEAST_CLIPPED, clipped_sentence
 from service.reporting.progress import Timings
 from service.reporting.provenance import metadata
 from service.requests.basis import BasisKind, BasisRequest
@@ -50,6 +52,8 @@ class BasisCapture(NamedTuple):
     space: str
     """The scene-linear colour space of the stack."""
     provenance: dict[str, str]
+    warnings: tuple[str, ...]
+    """Sentences about readings that are clipped."""
 
     @property
     def where(self) -> str:
@@ -85,6 +89,7 @@ class BasisResult(NamedTuple):
     """Root mean square of (image as the file gives it − image), divided by that of the images."""
     levels_rms: float | None
     """The same in steps of an 8-bit display, where the file holds display values."""
+    warnings: tuple[str, ...]
     key_lights_rms: float | None
     """Relative error of pictures under key lights from between the captured lights, where the file gives sums of images."""
 
@@ -107,7 +112,10 @@ def open_capture(request: BasisRequest | PublishRequest, timings: Timings) -> Ba
     inside[: stack.pixel_count] = mask.reshape(-1)
     near = len(capture.lit_by(PointLight))
     provenance = metadata(request, capture=capture.name, inputs=stack.key, near_lights=near)
-    return BasisCapture(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance)
+    clipping = Clipping.of(stack, inside[: stack.pixel_count])
+    shares = clipping.share(np.broadcast_to(stack.scale, (1, 3, len(stack.scale))))[0]
+    warnings = (clipped_sentence(shares, clipping.pixels, "the picture under all lights"),) if shares.max() >= LEAST_CLIPPED else ()
+    return BasisCapture(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance, warnings)
 
 
 class StackBand(NamedTuple):

@@ -25,6 +25,8 @@ from stage.stack.fingerprint import digest
 
 CAMERA_TOLERANCE = 1e-3
 """Largest difference of a number of the two cameras, pixels or parts of it: both results have them from manifests."""
+ROUNDING = 1e-9
+"""What rounding leaves of a number of a pose or a distortion that is 0."""
 CONTRADICTION = 0.5
 """Part of the relief of the depth that normals may leave unexplained before the two are refused as not of one surface: it is below .01
 where they are, and above 1 where the normals point another way."""
@@ -87,15 +89,16 @@ def _check_cameras(one: Camera, other: Camera, maps_file: Path, depth_file: Path
     """Refuse two cameras that see other pixels, or whose pixels have no length in metres."""
     def numbers(camera: Camera) -> dict[str, Any]:
         pose = None if one.world_from_camera is None or other.world_from_camera is None else camera.world_from_camera
+        lens = (0.0,) * 5 if camera.distortion is None else (*camera.distortion.k, *camera.distortion.p)
         return {"projection": camera.projection, "resolution": camera.resolution, "focal_px": camera.focal_px,
-                "principal_px": camera.principal_point, "distortion": None if camera.distortion is None else
-                (*camera.distortion.k, *camera.distortion.p), "pixel_size_m": camera.pixel_size_m, "world_from_camera": pose}
+                "principal_px": camera.principal_point, "distortion": lens,
+                "pixel_size_m": camera.pixel_size_m, "world_from_camera": pose}
 
     here, there = numbers(one), numbers(other)
     for name, value in here.items():
         same = value == there[name]
         if not same and None not in (value, there[name]) and not isinstance(value, str):
-            same = np.allclose(np.asarray(value, dtype=float), np.asarray(there[name], dtype=float), rtol=CAMERA_TOLERANCE, atol=0)
+            same = np.allclose(np.asarray(value, dtype=float), np.asarray(there[name], dtype=float), rtol=CAMERA_TOLERANCE, atol=ROUNDING)
         if not same:
             raise RequestError(f"{depth_file}: {name} of its camera is not that of {maps_file}: both must be of one camera in one place")
     if one.projection == "orthographic" and one.pixel_size_m is None:

@@ -84,7 +84,7 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
     timings.close()
     first = {PublishedAs.IIIF: MANIFEST_FILE, PublishedAs.OPENLIME: INFO_FILE, PublishedAs.WEB: PAGE_FILE}[request.kind]
     return PublishResult(request.out / first, len(sizes), sum(sizes), source.near, source.stack.light_count - len(front),
-                         loss, () if doubt is None else (doubt,))
+                         loss, (*source.warnings, *(() if doubt is None else (doubt,))))
 
 
 def _with_capture(request: PublishRequest) -> PublishRequest:

@@ -11,7 +11,7 @@ import numpy as np
 from kernels.relight.weights.environment_sources import EnvironmentParts, EnvironmentSamples, sample_environment, split_environment
 from service.errors import RequestError
 from service.requests.light.frame_range import numbered
-from stage.colour.environment_maps import check_environment, read_environment
+from stage.colour.environment_maps import check_environment, outside_sentences, read_environment
 from stage.stack import fingerprint
 
 SHARP_RADIUS_DEGREES = 2.0
@@ -19,9 +19,8 @@ SHARP_RADIUS_DEGREES = 2.0
 other samples is interpolated from the captured lights around them."""
 
 
-LEAST_OUTSIDE, FEW_ROWS = 0.01, 16
-"""Part of the light of a map, added by colours outside of the working space, from which on it is said; and number of rows below which it is
-said that texels count by their middle, which makes an even map of 16 rows 0.2 % brighter."""
+FEW_ROWS = 16
+"""Number of rows below which it is said that texels count by their middle, which makes an even map of 16 rows 0.2 % brighter."""
 
 
 class EnvironmentMap:
@@ -84,12 +83,8 @@ class Environments:
 
     def doubts(self) -> list[str]:
         """Return a sentence for each thing that makes the light of the maps that were read so far another one than theirs."""
-        found = []
-        most = max(self.outside, key=lambda name: self.outside[name], default=None)
-        if most is not None and self.outside[most] >= LEAST_OUTSIDE:
-            found.append(f"environment {most}: has colours outside of the working space, of which channels below 0 are set to 0: that adds "
-                         f"{100 * self.outside[most]:.2g} % of its light; give images, or lamps, in a wider space, or a map without such "
-                         "colours")
+        found = outside_sentences(self.outside, "environment", "the working space",
+                                  "give images, or lamps, in a wider space, or a map without such colours")
         fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
         if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
             half = np.pi / (2 * rows)

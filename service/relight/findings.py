@@ -77,12 +77,16 @@ class FrameFindings:
             found.append(f"{_percent(self.beyond)} of the light of {_picture(self.beyond_frame)} comes from directions more than "
                          f"{self.beyond_degrees:.0f} degrees from every captured light: {GUIDED_BEYOND if self.guided else PLAIN_BEYOND}")
         if max(self.clipped) >= LEAST_CLIPPED:
-            red, green, blue = (_percent(share) for share in self.clipped)
-            known = GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED
-            found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
-                         "readings that are clipped in every frame of their light, at "
-                         f"{_percent(self.clipped_pixels)} of the object's pixels: it is {known}")
+            found.append(clipped_sentence(self.clipped, self.clipped_pixels, _picture(self.clipped_frame),
+                                          GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED))
         return (*self.doubts, *found, *clipping_sentences(self.negative))
+
+
+def clipped_sentence(shares: Sequence[float], pixels: float, picture: str, known: str = PLAIN_CLIPPED) -> str:
+    """Return what is to be said of the shares of red, green and blue of a picture from clipped readings, at a share of the pixels."""
+    red, green, blue = (_percent(share) for share in shares)
+    return (f"{red} of the red, {green} of the green and {blue} of the blue of {picture} is from readings that are clipped in every frame "
+            f"of their light, at {_percent(pixels)} of the object's pixels: it is {known}")
 
 
 @dataclass

@@ -10,7 +10,18 @@ from stage.errors import ImageError
 from stage.formats import exr, images
 
 SUFFIXES = {".exr", ".hdr"}
+LEAST_OUTSIDE = 0.01
+"""Part of light, added by colours outside of a space, from which on it is said."""
 
+
+def outside_sentences(outside: dict[str, float], what: str, space: str, remedy: str) -> list[str]:
+    """Return a sentence about the light that gains most by colours outside of the gamut of a space, or none where it gains little.
+    `outside`: by the names of files, as read_environment tells. `what`: the kind of light. `space`, `remedy`: in words."""
+    most = max(outside, key=lambda name: outside[name], default=None)
+    if most is None or outside[most] < LEAST_OUTSIDE:
+        return []
+    return [f"{what} {most}: has colours outside of {space}, of which channels below 0 are set to 0: that adds {100 * outside[most]:.2g} % "
+            f"of its light; {remedy}"]
 
 
 def check_environment(path: Path) -> None:

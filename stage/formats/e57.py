@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class E57Scan(NamedTuple):
     """One scan of a file."""
 
     points: np.ndarray  # [n, 3] float64, metres, in the frame of the scanner where there is a pose
-    colours: np.ndarray | None  # [n, 3] uint8
+    colours: np.ndarray | None  # [n, 3] float64, from 0 to 1, 255 or 65535, as in the file
     pose: np.ndarray | None  # [4, 4] world from scanner, stretched by the square of its quaternion; None: the file says none
 
 
@@ -30,8 +30,17 @@ def read_e57(path: Path) -> Iterator[E57Scan]:
         raise ResultError(f"{path}: E57 files need pye57: pip install 'relit[e57]'")
     import pye57
 
+    class File(pye57.E57):  # type: ignore[misc]
+        """A file whose colours are read as they are: pye57 itself reads them into bytes, which hold no 16 bits and no parts of 1."""
+
+        def make_buffer(self, field_name: str, capacity: int, do_conversion: bool = True, do_scaling: bool = True) -> Any:
+            if field_name not in COLOURS:
+                return super().make_buffer(field_name, capacity, do_conversion, do_scaling)
+            values = np.empty(capacity, np.float64)
+            return values, pye57.libe57.SourceDestBuffer(self.image_file, field_name, values, capacity, do_conversion, do_scaling)
+
     try:
-        with pye57.E57(str(path)) as file:
+        with File(str(path)) as file:
             for number in range(file.scan_count):
                 header = file.get_header(number)
                 if not any(all(name in header.point_fields for name in axes) for axes in (AXES, SPHERICAL)):

@@ -21,6 +21,8 @@ RECORD_OWNER, RECORD_ID = "relit", 1
 """The owner and the number of the record that holds the scale of intensity and the provenance as JSON."""
 MOST_RETURNS = 15
 """The most returns of a shot that LAS can number."""
+NOISE_CLASSES = (7, 18)
+"""The classes of low points and high noise (LAS 1.4, table 17)."""
 COORDINATES = ('LOCAL_CS["world of the scan",LOCAL_DATUM["world of the scan",0],UNIT["metre",1],'
                'AXIS["x",OTHER],AXIS["y",OTHER],AXIS["z",OTHER]]')
 """The coordinate system, which LAS 1.4 requires: coordinates are in the world frame of the track of the platform, not on a map."""
@@ -98,16 +100,22 @@ def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the points of a LAS or LAZ file. Raises ResultError if laspy is not installed, or the file is no LAS file.
+    """Read the points of a LAS or LAZ file, but those that are withheld or classified as noise.
+    Raises ResultError if laspy is not installed, or the file is no LAS file, or a part of one.
     Returns points: [n, 3] float64, in the unit of the file. colours: [n, 3] uint8, or None."""
     if not las_is_installed():
         raise ResultError(f"{path}: LAS files need laspy: pip install 'relit[las]'")
     import laspy
 
     try:
-        cloud = laspy.read(path)
+        with laspy.open(path) as reader:
+            promised = reader.header.point_count
+            cloud = reader.read()
     except (laspy.errors.LaspyException, ValueError, EOFError) as error:
         raise ResultError(f"{path}: is no LAS file that laspy reads: {' '.join(str(error).split())}") from error
+    if len(cloud.points) != promised:
+        raise ResultError(f"{path}: is truncated: it holds {len(cloud.points)} of {promised} points")
+    cloud = cloud[(np.asarray(cloud.withheld) == 0) & ~np.isin(np.asarray(cloud.classification), NOISE_CLASSES)]
     points = np.stack([np.asarray(cloud[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     names = set(cloud.point_format.dimension_names)
     if not {"red", "green", "blue"} <= names:

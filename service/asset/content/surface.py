@@ -1,7 +1,7 @@
 """Solved maps as an asset has them, whatever its format, with their camera; reports of writers, and findings of relit inspect."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -73,6 +73,10 @@ def unit_in_metres(camera: Camera) -> float:
     return 1.0 if camera.metric else UNIT_WITHOUT_SCALE_M
 
 
+READABLE = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
+"""Images that can be read unless they are damaged."""
+
+
 class Part(NamedTuple):
     """One row of the table of what an asset holds."""
 
@@ -95,14 +99,28 @@ class Inspection(NamedTuple):
 
 
 def image_facts(data: bytes, name: str) -> dict[str, Any]:
-    """Return the size of an image and the type of its values, or its bytes alone where it cannot be read."""
+    """Return the size of an image and the type of its values, or its bytes alone where it cannot be read; `damaged`: it should be."""
     with tempfile.NamedTemporaryFile(suffix=PurePosixPath(name).suffix) as file:
         file.write(data)
         file.flush()
         image = oiio.ImageInput.open(file.name)
+    damaged = {"damaged": True} if PurePosixPath(name).suffix.lower() in READABLE else {}
     if image is None:
         oiio.geterror()  # else OpenImageIO prints it at the end of the program
-        return {"bytes": len(data)}
+        return {"bytes": len(data)} | damaged
     spec = image.spec()
+    whole = image.read_image(oiio.UINT8) is not None
+    if not whole:
+        image.geterror()
     image.close()
-    return {"bytes": len(data), "resolution": [spec.width, spec.height], "channels": spec.nchannels, "depth": str(spec.format)}
+    return {"bytes": len(data), "resolution": [spec.width, spec.height], "channels": spec.nchannels, "depth": str(spec.format),
+            **({} if whole else damaged)}
+
+
+def texture_faults(parts: Iterable[Part]) -> Iterator[str]:
+    """Yield a sentence for each texture that is damaged or names no file."""
+    for part in parts:
+        if part.kind == "texture" and part.facts.get("damaged"):
+            yield f"{part.name}: {part.facts['file']} is no image that can be read, or a damaged one"
+        elif part.kind == "texture" and part.facts.get("missing") and not part.facts["file"]:
+            yield f"{part.name}: the texture names no file"

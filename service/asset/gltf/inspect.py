@@ -11,8 +11,9 @@ from urllib.parse import unquote
 
 from pygltflib import GLTF2, POINTS, TRIANGLES
 
-from service.asset.content.surface import Inspection, Part, image_facts
+from service.asset.content.surface import Inspection, Part, image_facts, texture_faults
 from service.asset.gltf.container import COMPONENT_BYTES, ELEMENT_SIZES, GlbContents, read_glb
+from service.asset.gltf.geometry_faults import geometry_faults
 from service.errors import AssetError
 from stage.errors import storage
 
@@ -42,7 +43,7 @@ def _inspect(path: Path, contents: GlbContents) -> Inspection:
     errors = [f"{file} is not there, and the document refers to it" for file in beside if not file.is_file()]
     size = path.stat().st_size + sum(file.stat().st_size for file in beside if file.is_file())
     return Inspection(str(path), size, facts, tuple(parts), provenance, tuple(warnings),
-                      (*contents.faults, *errors, *_faults(contents)))
+                      (*contents.faults, *errors, *(list(_faults(contents)) or geometry_faults(path, contents)), *texture_faults(parts)))
 
 
 def _primitives(document: GLTF2) -> Iterator[Part]:

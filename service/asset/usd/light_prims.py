@@ -35,9 +35,10 @@ LIGHT_SPACE = "lin_rec709_scene"
 """Colour space of the lights: their colours have no declaration that clients read, and all take them as this."""
 
 
-def write_dome_texture(environment: Path, texture: Path, *, clipped: dict[str, int] | None = None) -> None:
-    """Write a lat-long environment map, .exr or .hdr, as the texture of a dome light, and count what is clipped."""
-    write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped), texture)
+def write_dome_texture(environment: Path, texture: Path, *, clipped: dict[str, int] | None = None,
+                       outside: dict[str, float] | None = None) -> None:
+    """Write a lat-long environment map, .exr or .hdr, as the texture of a dome light, and count what is clipped, and what is outside."""
+    write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped, outside=outside), texture)
 
 
 def write_radiance(radiance: np.ndarray, texture: Path) -> None:
@@ -66,6 +67,14 @@ def light_colour(rgb: tuple[float, float, float], space: str) -> tuple[float, tu
     intensity = float(channels.max())
     red, green, blue = channels / (intensity or 1.0)
     return intensity, (red, green, blue)
+
+
+def outside_gamut(light: DistantLight | PointLight | ExtendedLight, space: str) -> float:
+    """Return the part of a light that its colours gain because channels that LIGHT_SPACE has below 0 are set to 0."""
+    given = {"distant": "irradiance", "point": "intensity", "extended": "radiance"}[light.type]
+    channels = convert(np.array(getattr(light, given), np.float32).reshape(1, -1, 3), space, LIGHT_SPACE)
+    whole = float(np.maximum(channels, 0).sum())
+    return float(np.maximum(-channels, 0).sum()) / whole if whole > 0 and space != LIGHT_SPACE else 0.0
 
 
 POINT_RADIUS_M = 0.001
@@ -117,9 +126,10 @@ def rig_lights(capture: Capture) -> list[RigLight]:
     return list(found.values())
 
 
-def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> list[Path]:
+def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray, outside: dict[str, float]) -> list[Path]:
     """Define the variant `rig` of `light` from the lights of a capture, and return the textures of dome lights, beside the layer.
-    `extent`: [2, 3] bounding box of the surface, camera frame, scene units."""
+    `extent`: [2, 3] bounding box of the surface, camera frame, scene units. `outside`: is given what colours outside of the gamut of
+    LIGHT_SPACE gain, by the image of the light."""
     lights = rig_lights(capture)
     textures: list[Path] = []
     with layers.lighting(RIG) as usd_stage:
@@ -127,7 +137,7 @@ def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> lis
         rig.GetPrim().SetCustomDataByKey("relit:irradiance_scale", capture.manifest.irradiance_scale)
         for lit in lights:
             path = rig.GetPath().AppendChild(f"Light_{lit.frames[0]:04d}")
-            emission, texture = _define_light(usd_stage, path, lit, capture, layers.lights, extent)
+            emission, texture = _define_light(usd_stage, path, lit, capture, layers.lights, extent, outside)
             if texture is not None:
                 textures.append(texture)
             _set_emission(emission, lit, len(capture.manifest.frames))
@@ -136,10 +146,12 @@ def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> lis
 
 
 def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: Capture, folder: Path,
-                  extent: np.ndarray) -> tuple[_Emission, Path | None]:
+                  extent: np.ndarray, outside: dict[str, float]) -> tuple[_Emission, Path | None]:
     """Define one light without its intensity; return what it emits, and its texture where it has one."""
     light, space = lit.light, linear_space(capture.manifest.color_space)
     where = f"{capture.folder / FILE_NAME}: frames[{lit.frames[0] - 1}].light"
+    if isinstance(light, DistantLight | PointLight | ExtendedLight):
+        outside[lit.images[0]] = outside_gamut(light, space)
     if isinstance(light, DistantLight):
         distant = _define_distant(usd_stage, path, light.direction, 0.0, extent)
         return _Emission(distant, *light_colour(light.irradiance, space)), None
@@ -161,7 +173,8 @@ def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: 
         return _define_point(usd_stage, path, light, space), None
     texture = folder / f"{RIG}_{lit.frames[0]:04d}.exr"
     if isinstance(light, EnvironmentLight):
-        write_dome_texture(capture.file(light.image), texture, clipped=capture.clipped if capture.pixels.clip_negative else None)
+        write_dome_texture(capture.file(light.image), texture, clipped=capture.clipped if capture.pixels.clip_negative else None,
+                           outside=outside)
     elif light.axis == "full":
         return _Emission(define_dome(usd_stage, path, None), 1.0, (1.0, 1.0, 1.0)), None
     else:

@@ -48,6 +48,8 @@ class Surroundings(NamedTuple):
     """Relit frames by their numbers, which become the variant `card` of `geo`."""
     clipped: dict[str, int] | None = None
     """Counts of clipped values as in stage.colour.environment_maps.read_environment, for lat-long maps."""
+    outside: dict[str, float] | None = None
+    """Is given what colours gain of which Rec.709 has a channel below 0, by files; see the same function."""
 
 
 class AssetFiles(NamedTuple):
@@ -76,16 +78,17 @@ def define_surroundings(files: AssetFiles, surroundings: Surroundings, camera: C
     `files`: of the asset, to which those of the surroundings are added. `extent`: [2, 3] bounding box of the surface, camera frame, scene
     units."""
     layers, clipped_pixels = files.layers, {}
+    outside = {} if surroundings.outside is None else surroundings.outside
     if surroundings.card is not None:
         written = card_images.write_card(surroundings.card, files.textures, as_png=layers.packed)
         _define_card(layers, written, camera, extent)
         files.beside[:0] = [files.textures / name for names in (written.colours, written.opacities) for name in names.values()]
         clipped_pixels["card"] = written.clipped_pixels
-    textures = [] if surroundings.rig is None else define_rig(layers, surroundings.rig, extent)
+    textures = [] if surroundings.rig is None else define_rig(layers, surroundings.rig, extent, outside)
     if surroundings.environment is not None:
         with layers.lighting(ENVIRONMENT) as usd_stage:
             texture = layers.lights / f"{ENVIRONMENT}.exr"
-            write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped)
+            write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped, outside=outside)
             define_dome(usd_stage, layers.root.AppendChild(ENVIRONMENT.capitalize()), f"./{texture.name}")
         textures.append(texture)
     files.lights.extend([*layers.light_files, *textures])

@@ -132,3 +132,4 @@ def _basis(result: Any) -> None:
         print(f"lights   {result.left_out} are not in front of the object and are left out")
     if result.near_lights:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
+    print_warnings(result.warnings)

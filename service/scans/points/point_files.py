@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.scans.points.ply_points import eight_bits
 from stage.errors import ResultError, storage
 from stage.formats.e57 import read_e57
 from stage.formats.las import read_las
@@ -119,7 +120,7 @@ def _pcd(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
         there = all(name in (layout.names or ()) for name in names)
         return np.concatenate([values[name][:, :1] for name in names], axis=1) if there else None
 
-    normals, packed = columns("normal_x", "normal_y", "normal_z"), columns("rgb")
+    normals, packed = columns("normal_x", "normal_y", "normal_z"), columns("rgb" if "rgb" in (layout.names or ()) else "rgba")
     points = np.concatenate([values[name][:, :1] for name in "xyz"], axis=1).astype(np.float64)
     finite = np.isfinite(points).all(axis=1)
     colours = None if packed is None or packed.itemsize != 4 else np.ascontiguousarray(packed).view(np.uint8)[finite, 2::-1]
@@ -136,8 +137,8 @@ def _e57(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
     """Yield the scans of an E57 file; a scanner with a pose stands in the origin of its points."""
     for points, colours, pose in read_e57(path):
         finite = np.isfinite(points).all(axis=1)
-        yield PointScan(points[finite], None if colours is None else colours[finite], viewpoint=None if pose is None else np.zeros(3),
-                        pose=pose)
+        yield PointScan(points[finite], None if colours is None else eight_bits(colours[finite]),
+                        viewpoint=None if pose is None else np.zeros(3), pose=pose)
 
 
 READERS: dict[str, Callable[[io.BufferedReader, Path], Iterator[PointScan]]] = {

@@ -286,3 +286,15 @@ def test_values_beyond_half_are_kept_in_float_and_one_light_and_one_pixel_are_en
     write_exr(tmp_path / "one" / "000.exr", np.zeros((1, 1, 3)))  # a black capture is still a sum of black images
     outcome = relit("basis", tmp_path / "one", "--out", tmp_path / "b.exr")
     assert outcome.code == 0 and said(outcome) == 0
+
+
+def test_clipped_readings_are_said(relit, tmp_path):
+    directions = dome(12)
+    images = write_dome(tmp_path / "cap", directions)
+    outs = [("basis", tmp_path / "cap", "--out", tmp_path / "b.exr"), ("basis", tmp_path / "cap", "--out", tmp_path / "b.ptm"),
+            ("publish", tmp_path / "cap", "--to", tmp_path / "planes", "--as", "openlime")]
+    edit_manifest(tmp_path / "cap", saturation=9 * float(images.max()))
+    assert not any("from readings that are" in relit(*words).out for words in outs)
+    edit_manifest(tmp_path / "cap", saturation=0.6 * float(images.max()))
+    assert all("from readings that are clipped in every frame of their light" in relit(*words).out for words in outs)
+    assert "clipped" in facts_of(tmp_path / "b.exr")["warnings"][0] and "clipped" in facts_of(tmp_path / "b.ptm")["warnings"][0]

@@ -319,3 +319,11 @@ def test_inputs_are_not_replaced_and_must_be_there(relit, tmp_path):
     assert "would replace" in relit.refused("join", solved, depth, "--out", solved)
     assert (solved / "maps.exr").read_bytes() == before
     assert "run `relit depth` first" in relit.refused("join", solved, tmp_path / "nothing", "--out", tmp_path / "joined")
+
+
+def test_a_lens_without_distortion_and_rounded_zeros_are_the_same_camera(relit, tmp_path):
+    pose = np.eye(4)
+    pose[0, 1] = 1e-17
+    solved, depth, *_ = write(tmp_path, camera={"world_from_camera": np.eye(4).tolist()}, depth_camera={
+        "world_from_camera": pose.tolist(), "distortion": {"model": "brown_conrady"}})
+    assert relit("join", solved, depth, "--out", tmp_path / "joined").code == 0

@@ -1,6 +1,7 @@
 """What relit inspect says of a .glb, and its file complete or absent."""
 
 import json
+import re
 import struct
 
 import numpy as np
@@ -198,3 +199,35 @@ def test_an_unknown_suffix_names_the_known(tmp_path):
     with pytest.raises(AssetError, match=r"\.usda, \.usdc or \.usdz for USD, or \.glb for glTF"):
         export(ExportRequest(maps=tmp_path, out=tmp_path / "a.gltf"))
     assert [path.name for path in tmp_path.iterdir()] == ["maps.exr"]
+
+
+@pytest.mark.parametrize("name, value, sentence", [
+    ("POSITION", np.float32(np.nan), "1 of its [0-9]+ values of POSITION are not finite"),
+    ("TEXCOORD_0", np.float32(np.inf), "1 of its [0-9]+ values of TEXCOORD_0 are not finite"),
+    ("indices", np.uint16(60000), "has a face of vertex 60000, and"),
+    ("image", b"damaged!", "is no image that can be read, or a damaged one"),
+])
+def test_faults_of_geometry_and_textures_are_errors(name, value, sentence, tmp_path):
+    path = written(tmp_path)
+    document, rest = chunks(path)
+    primitive = document["meshes"][0]["primitives"][0]
+    if name == "image":
+        view = document["bufferViews"][document["images"][0]["bufferView"]]
+    else:
+        accessor = document["accessors"][primitive["indices"] if name == "indices" else primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+    at = 8 + view.get("byteOffset", 0)
+    raw = value if isinstance(value, bytes) else value.tobytes()
+    with_document(path, json.dumps(document).encode(), rest[:at] + raw + rest[at + len(raw):])
+    assert any(re.search(sentence, error) for error in inspect_glb(path).errors)
+
+
+def test_attributes_of_other_lengths_and_accessors_that_are_not_there_are_errors(tmp_path):
+    def shorter(document):
+        document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]]["count"] -= 1
+
+    def absent(document):
+        document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = 99
+
+    assert "values of TEXCOORD_0" in inspect_glb(rewritten(written(tmp_path), shorter)).errors[0]
+    assert "refers to accessor 99, which is not there" in inspect_glb(rewritten(written(tmp_path), absent)).errors[0]

@@ -1,6 +1,7 @@
 """The findings of relit inspect about USD assets that are right, and about broken ones."""
 
 import json
+import re
 import shutil
 import zipfile
 
@@ -273,3 +274,55 @@ def test_a_shot_that_refers_to_a_package(ball, tmp_path):
     found = inspect_usd(tmp_path / "shot.usda")
     assert found.size_bytes == sum((tmp_path / name).stat().st_size for name in ("shot.usda", "ball.usdz"))
     assert all("resolution" in part.facts for part in of_kind(found, "texture"))
+
+
+FLAT = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+
+
+def square(path, *, points=FLAT, indices=(0, 1, 2, 3), st=((0, 0), (1, 0), (1, 1), (0, 1)), texture=None):
+    """A file with one face, as another program may write it."""
+    usd_stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(usd_stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(usd_stage, 1)
+    usd_stage.SetDefaultPrim(UsdGeom.Xform.Define(usd_stage, "/A").GetPrim())
+    mesh = UsdGeom.Mesh.Define(usd_stage, "/A/M")
+    mesh.CreatePointsAttr(points)
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr(list(indices))
+    mesh.CreateSubdivisionSchemeAttr("none")
+    mesh.CreateExtentAttr([(0, 0, 0), (1, 1, 0)])
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex").Set(st)
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("sigma", Sdf.ValueTypeNames.FloatArray, "vertex").Set([1, 1, 1, float("nan")])  # not known
+    if texture is not None:
+        material, shader = UsdShade.Material.Define(usd_stage, "/A/Mat"), UsdShade.Shader.Define(usd_stage, "/A/Mat/S")
+        image = UsdShade.Shader.Define(usd_stage, "/A/Mat/T")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        image.CreateIdAttr("UsdUVTexture")
+        image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(texture)
+        image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(image.ConnectableAPI(), "rgb")
+        shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+        material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    usd_stage.GetRootLayer().Save()
+    return inspect_usd(path).errors
+
+
+@pytest.mark.parametrize("changes, sentence", [
+    ({}, None),
+    ({"points": [*FLAT[:3], (0, float("nan"), 0)]}, r"/A/M\.points: 1 of its 4 values are not finite"),
+    ({"indices": (0, 1, 2, 7)}, "/A/M: its faces are wrong: .* 7"),
+    ({"st": ((0, 0), (1, 0))}, r"/A/M\.primvars:st: has 2 values, and its interpolation needs 4"),
+    ({"st": ((0, 0), (1, 0), (1, 1), (0, float("inf")))}, r"/A/M\.primvars:st: 1 of its 4 values are not finite"),
+    ({"texture": "whole.png"}, None),
+    ({"texture": "half.png"}, r"diffuseColor: half\.png is no image that can be read"),
+    ({"texture": "text.png"}, r"diffuseColor: text\.png is no image that can be read"),
+    ({"texture": ""}, "diffuseColor: the texture names no file"),
+])
+def test_faults_of_geometry_and_textures_are_errors(changes, sentence, tmp_path):
+    write_png(tmp_path / "whole.png", np.random.default_rng(0).random((64, 64, 3), np.float32), srgb=True)
+    data = (tmp_path / "whole.png").read_bytes()
+    (tmp_path / "half.png").write_bytes(data[:len(data) // 2])
+    (tmp_path / "text.png").write_text("no picture")
+    errors = square(tmp_path / "a.usda", **changes)
+    assert len(errors) == (sentence is not None) and all(re.search(str(sentence), error) for error in errors)

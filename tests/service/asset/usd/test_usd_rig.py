@@ -275,3 +275,15 @@ def test_the_camera_does_not_widen_the_bounding_box(tmp_path):
     extent = height_mesh(maps).extent
     np.testing.assert_allclose(box.ComputeAlignedRange().GetMin(), extent[0])
     np.testing.assert_allclose(box.ComputeAlignedRange().GetMax(), extent[1])
+
+
+@pytest.mark.parametrize("space, said", [("lin_ap1_scene", True), ("lin_rec709_scene", False)])
+def test_lights_that_rec709_does_not_hold_are_said(space, said, relit, tmp_path):
+    maps = make_ball()
+    maps.write(tmp_path / "maps.exr")
+    capture_of(tmp_path / "rig", maps.camera, [{"type": "distant", "direction": [0, 0, 1], "irradiance": [0, 2, 0]}], color_space=space)
+    green = np.zeros((32, 64), np.float16)
+    exr.write(tmp_path / "sky.exr", {"R": green, "G": green + 1, "B": green}, color_space=space, metadata={})
+    for given, name in (("--rig", tmp_path / "rig"), ("--environment", tmp_path / "sky.exr")):
+        outcome = relit("export", tmp_path, "--out", tmp_path / "a.usda", given, name)
+        assert outcome.code == 0 and ("has colours outside of Rec.709" in outcome.out) == said
