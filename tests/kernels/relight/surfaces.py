@@ -4,9 +4,11 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels import packs
 from kernels.packs import pack_type
 from kernels.relight.model import shading
-from tests.kernels.scenes import store
+from kernels.relight.model.captured import Captured
+from tests.kernels.scenes import bits, store
 from tests.reference.shading import Pixels
 
 FLOAT = 2.0**-24
@@ -50,6 +52,16 @@ def pack_bytes(rows: np.ndarray, device: str) -> wp.array:
     pack = devices.pack_width(device)
     padded = np.pad(rows, ((0, 0), (0, -rows.shape[1] % pack)), constant_values=7)
     return wp.array(padded.reshape(len(rows), -1, pack), dtype=pack_type(pack, wp.uint8), device=device)
+
+
+def captured(pixels: Pixels, readings: np.ndarray, lights: np.ndarray, irradiance: np.ndarray, device: str, *,
+             visible: np.ndarray | None = None, clipped: np.ndarray | None = None) -> tuple[Captured, np.ndarray]:
+    """Images of readings [lights, 3, P] beside the pixels, which see all lights where `visible` [lights, P] does not say otherwise; and the
+    readings that their stack holds. `clipped` [lights, P]: which readings the sensor cut off."""
+    stack, scale, held = stored(readings, irradiance)
+    visible = np.full((len(lights), len(pixels.normal)), 255, np.uint8) if visible is None else visible
+    band = packs.upload(stack, None if clipped is None else bits(clipped), device=device)
+    return Captured.of(band, upload(pixels, device), pack_bytes(visible, device), lights, irradiance, scale), held
 
 
 def stored(readings: np.ndarray, irradiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ from stage.capture.camera import Camera
 from stage.errors import StageError
 from stage.tof.calibration import read_calibration
 from tests.reference import tof
-from tests.service.depth.tof.test_tof import cw_frames, pulsed_frames, run, write
+from tests.scenes.tof import cw_frames, pulsed_frames, write
+from tests.service.depth.tof.test_tof import run
 
 ROWS, COLS = 12, 16
 CAMERA = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [20.0, 20.0]}

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from kernels import packs
 from kernels.relight.model.beyond import LONGEST_REACH, compare_beyond, followed, inward_pairs, reach, share_beyond, spacing
-from kernels.relight.model.captured import Captured
 from tests.kernels.relight.lights import AXES, icosahedron, scattered
-from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
+from tests.kernels.relight.surfaces import LOBE, captured, facing, scattered_pixels
 from tests.kernels.scenes import cap, colours
 from tests.reference import shading as reference
 
@@ -53,13 +51,7 @@ def test_gains_are_added_and_losses_are_shares():
 
 
 def sums(pixels, readings, device, *, clipped=None):
-    stack, scale, held = stored(readings, IRRADIANCE)
-    bits = None
-    if clipped is not None:
-        bits = np.packbits(np.pad(clipped, ((0, stack.shape[1] - len(clipped)), (0, 0))), axis=0, bitorder="little")
-    visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8)
-    images = Captured.of(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE,
-                         scale)
+    images, held = captured(pixels, readings, LIGHTS, IRRADIANCE, device, clipped=clipped)
     got = compare_beyond(images, PAIRS)
     return got.numpy()[:, : len(pixels.normal)], held
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import MOST_RATIO, sum_shown
-from tests.kernels.relight.surfaces import LOBE, pack_bytes, scattered_pixels, stored, upload
+from tests.kernels.relight.surfaces import LOBE, captured, scattered_pixels
 from tests.kernels.scenes import cap, colours
 from tests.reference import shading as reference
 
@@ -16,9 +14,7 @@ IRRADIANCE = 3 * colours(24, seed=4)
 
 
 def shown(pixels, readings, energy, device, visible=None):
-    stack, scale, held = stored(readings, IRRADIANCE)
-    visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    images, held = captured(pixels, readings, LIGHTS, IRRADIANCE, device, visible=visible)
     return sum_shown(images, np.asarray(energy)), held
 
 

@@ -10,7 +10,7 @@ from kernels.relight.model.guide import LEAST_ALPHA, POOL, compare_model, fit_tr
 from kernels.relight.model.shading import SecondLobe, upload_surface
 from service.relight.weights.triangulation import left_out
 from tests.kernels.relight.lights import AXES, icosahedron
-from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
+from tests.kernels.relight.surfaces import LOBE, captured, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store
 from tests.reference import shading as reference
 from tests.reference.microfacet import distribution
@@ -27,9 +27,7 @@ def matte(count, seed=0):
 
 def compared(pixels, readings, device, *, visible=None, shares=SHARES):
     """[2, P] of compare_model, and the readings that its band holds."""
-    stack, scale, held = stored(readings, IRRADIANCE)
-    visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    images, held = captured(pixels, readings, LIGHTS, IRRADIANCE, device, visible=visible)
     got = compare_model(images, NEIGHBOURS, shares)
     return got.numpy()[:, : len(pixels.normal)], held
 

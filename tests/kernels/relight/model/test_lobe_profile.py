@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from kernels import packs
-from kernels.relight.model.captured import Captured
 from kernels.relight.model.lobe_profile import PLAIN, fit_profile, profile_moments
 from kernels.relight.model.shading import shade, upload_surface
 from kernels.relight.model.sources import far
-from tests.kernels.relight.surfaces import LOBE, pack_bytes, scattered_pixels, stored, upload
+from tests.kernels.relight.surfaces import LOBE, captured, scattered_pixels
 from tests.kernels.scenes import cap, colours
 from tests.reference import shading as reference
 
@@ -35,11 +33,8 @@ def steepness(pixels, direction):
 
 
 def fitted(pixels, readings, device, *, clipped=None):
-    stack, scale, _ = stored(readings, IRRADIANCE)
-    visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8)
-    bits = None if clipped is None else np.packbits(clipped, axis=0, bitorder="little")
-    moments = profile_moments(Captured.of(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device),
-                                          LIGHTS, IRRADIANCE, scale))
+    images, _ = captured(pixels, readings, LIGHTS, IRRADIANCE, device, clipped=clipped)
+    moments = profile_moments(images)
     return fit_profile(moments.numpy()[:, : len(pixels.normal)], np.arange(SIDE * SIDE), (SIDE, SIDE))
 
 

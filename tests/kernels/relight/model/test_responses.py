@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.frames import combine
 from kernels.relight.model import sources
-from kernels.relight.model.captured import Captured
 from kernels.relight.model.responses import empty_responses, respond, shown_gloss
 from kernels.relight.model.shading import shade_frames, upload_sources
 from tests.kernels.relight.lights import scattered
-from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, radiance, scattered_pixels, stored, upload
+from tests.kernels.relight.surfaces import FLOAT, LOBE, captured, pack_bytes, radiance, scattered_pixels, upload
 from tests.kernels.scenes import cap, colours
 from tests.reference import shading as reference
 
@@ -65,12 +63,11 @@ def test_memory_has_room_for_fewer_directions_and_pixels(device):
 
 def test_gloss_is_as_bright_as_the_images_show_it(device):
     pixels = scattered_pixels(50, seed=2)
-    visible = np.full((len(LIGHTS), 50), 255, np.uint8)
     own = sources.own_rows(sources.far(LIGHTS, IRRADIANCE))
     parts = reference.parts(pixels, LIGHTS)
-    stack, scale, held = stored(parts.sum(axis=0) * np.random.default_rng(3).uniform(0.5, 1.6, 50), IRRADIANCE)
-    _, _, found = responses(pixels, own, visible, device)
-    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    readings = parts.sum(axis=0) * np.random.default_rng(3).uniform(0.5, 1.6, 50)
+    images, held = captured(pixels, readings, LIGHTS, IRRADIANCE, device)
+    _, _, found = responses(pixels, own, np.full((len(LIGHTS), 50), 255, np.uint8), device)
     got = shown_gloss(images, found)
     ratio = reference.shown(held, parts)
     assert ratio.min() < 0.8 and ratio.max() == 1.25

@@ -1,8 +1,6 @@
 """Fog in histograms is named and no surface, and clipped counters are not taken for returns: a slope with a box before it and printed
 albedo, pulses integrated over the bins in closed form."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -10,9 +8,10 @@ from scipy.special import ndtr
 from service.depth.depth import depth
 from service.depth.tof.fog import find_fog
 from service.requests.depth import DepthRequest
+from tests.reference import tof
+from tests.scenes.tof import far_camera, pulsed_frames, write
 
 ROWS, COLS, BINS, BIN_M, WIDTH_M = 24, 32, 60, 0.1, 0.09
-LIGHT_M_S = 299792458.0
 
 
 def view():
@@ -37,11 +36,8 @@ def histograms(density, photons=40000.0, background=1.0):
 
 def solved(folder, counts):
     """What relit depth makes of the counts."""
-    np.save(folder / "h.npy", counts.reshape(ROWS, COLS, BINS))
-    (folder / "capture.json").write_text(json.dumps({
-        "schema": "relit.capture/1", "name": "slope",
-        "camera": {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [1e4, 1e4]},  # depth is range
-        "frames": [{"image": "h.npy", "tof": {"type": "pulsed", "bin_s": 2 * BIN_M / LIGHT_M_S, "start_s": 0.0}}]}))
+    frames = pulsed_frames(counts.reshape(ROWS, COLS, BINS), bin_s=2 * BIN_M / tof.LIGHT)
+    write(folder, frames, camera=far_camera(ROWS, COLS))
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
 
 

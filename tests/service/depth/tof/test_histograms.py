@@ -10,6 +10,7 @@ from service.depth.depth import depth
 from service.depth.tof.histograms import full_count
 from service.requests.depth import DepthRequest, TofOptions
 from tests.reference import tof
+from tests.scenes.tof import far_camera, pulsed_frames, write
 
 ROWS, COLS = 24, 32
 VIEW = tof.room(ROWS, COLS)
@@ -18,13 +19,7 @@ BIN_M = tof.LIGHT * BIN_S / 2
 
 
 def solve(folder, counts, least_confidence=None, options=None, near_m=None, **declared):
-    folder.mkdir(parents=True, exist_ok=True)
-    rows, cols = counts.shape[:2]
-    np.save(folder / "h.npy", counts.astype(np.float32))
-    (folder / "capture.json").write_text(json.dumps({
-        "schema": "relit.capture/1", "name": "room",
-        "camera": {"projection": "perspective", "resolution": [cols, rows], "focal_px": [1e4, 1e4]},  # depth is range
-        "frames": [{"image": "h.npy", "tof": {"type": "pulsed", "bin_s": BIN_S, "start_s": 0.0, **declared}}]}))
+    write(folder, pulsed_frames(counts.astype(np.float32), bin_s=BIN_S, **declared), camera=far_camera(*counts.shape[:2]))
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", least_confidence=least_confidence, near_m=near_m,
                               tof=TofOptions.model_validate(options or {})))
 

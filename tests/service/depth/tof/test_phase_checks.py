@@ -1,14 +1,13 @@
 """Phases that are declared backwards, or of other frequencies, and fog: named, and no range is believed. The room, its images and their
 noise are those of tests/reference/tof.py."""
 
-import json
-
 import numpy as np
 import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
 from tests.reference import tof
+from tests.scenes.tof import cw_frames, write
 
 ROWS, COLS = 72, 96
 VIEW = tof.room(ROWS, COLS)
@@ -35,12 +34,7 @@ def painted():
 
 def measured(folder, images, settings):
     """What relit depth makes of correlation images under these declarations."""
-    frames = []
-    for index, (image, (hz, delta)) in enumerate(zip(images, settings, strict=True)):
-        np.save(folder / f"{index:02d}.npy", image.astype(np.float32))
-        frames.append({"image": f"{index:02d}.npy", "tof": {"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta}})
-    camera = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]}
-    (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "room", "camera": camera, "frames": frames}))
+    write(folder, cw_frames(images, settings), camera={"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]})
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.reference import tof
-from tests.service.depth.tof.test_tof import VIEW, cw_frames, pulsed_frames, run, write
+from tests.scenes.tof import cw_frames, pulsed_frames, write
+from tests.service.depth.tof.test_tof import VIEW, run
 
 SETTINGS = tof.even(tof.HZ, 4)
 OWN_M = 0.08

@@ -14,30 +14,10 @@ from stage.results.depth_maps import DepthMaps
 from stage.stack.fingerprint import digest
 from stage.tof.calibration import Temperature, TofCalibration, fit_harmonics, write_calibration
 from tests.reference import tof
+from tests.scenes.tof import CAMERA, cw_frames, pulsed_frames, write
 
 ROWS, COLS = 96, 128
-CAMERA = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [110.0, 110.0]}
 VIEW = tof.room(ROWS, COLS)
-
-
-def write(folder, frames, *, camera=CAMERA, **more):
-    folder.mkdir(parents=True, exist_ok=True)
-    entries = []
-    for index, (values, light) in enumerate(frames):
-        np.save(folder / f"{index:02d}.npy", values)
-        entries.append({"image": f"{index:02d}.npy", "tof": light})
-    manifest = {"schema": "relit.capture/1", "name": "room", "camera": camera, "frames": entries, **more}
-    (folder / "capture.json").write_text(json.dumps(manifest))
-    return folder
-
-
-def cw_frames(images, settings):
-    return [(image, {"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta})
-            for image, (hz, delta) in zip(images, settings, strict=True)]
-
-
-def pulsed_frames(counts, **more):
-    return [(counts, {"type": "pulsed", "bin_s": 1.5e-9, "start_s": 0.0, **more})]
 
 
 def run(folder, near_m=None, far_m=None, least_confidence=None, **options):

@@ -11,10 +11,12 @@ from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from tests.reference import tof
+from tests.scenes.tof import cw_frames, pulsed_frames, write
 
 ROWS, COLS = 30, 40
 CAMERA = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [35.0, 35.0]}
 SOURCE = (0.05, -0.02, 0.01)
+SETTINGS = tof.even((60e6, 80e6), 4)
 
 
 def scene():
@@ -30,16 +32,6 @@ def scene():
     return range_m, np.linalg.norm(range_m[..., None] * ray - SOURCE, axis=-1)
 
 
-def write(folder, frames, source):
-    folder.mkdir()
-    entries = []
-    for index, (values, light) in enumerate(frames):
-        np.save(folder / f"{index}.npy", values)
-        entries.append({"image": f"{index}.npy", "tof": {**light, **({} if source is None else {"source_m": source})}})
-    (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "lamp", "camera": CAMERA, "frames": entries}))
-    return folder
-
-
 def solve(folder, **span):
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", **span)).maps
 
@@ -49,26 +41,21 @@ def view():
     return tof.View((range_m + leg) / 2, np.full(range_m.shape, 0.6), np.full(range_m.shape, 0.9))
 
 
-def cw_frames(settings, seed):
-    images = tof.correlations(view(), 3e4, settings, seed=seed)
-    return [(image, {"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta})
-            for image, (hz, delta) in zip(images, settings, strict=True)]
-
-
 def test_continuous_wave_is_exact_and_as_sure_as_it_says(tmp_path):
-    truth, frames = scene()[0], cw_frames(tof.even((60e6, 80e6), 4), 3)
-    maps = solve(write(tmp_path / "c", frames, SOURCE))
+    truth, images = scene()[0], tof.correlations(view(), 3e4, SETTINGS, seed=3)
+    maps = solve(write(tmp_path / "c", cw_frames(images, SETTINGS, source_m=SOURCE), camera=CAMERA))
     along = maps.depth / maps.range
     error = (maps.range - truth) * along / maps.sigma
     assert maps.mask.all() and 0.8 < np.median(np.abs(error)) / 0.6745 < 1.2 and np.abs(error).max() < 5
     assert np.abs(np.mean(maps.range - truth)) < 2.5e-4  # the mean of 1200 errors of 2 mm is 0.06 mm
-    bare = solve(write(tmp_path / "b", frames, None))
+    bare = solve(write(tmp_path / "b", cw_frames(images, SETTINGS), camera=CAMERA))
     assert np.median(np.abs(bare.range - truth)) > 3e-3  # half of the 5 cm, times their direction: what an undeclared source costs
 
 
 def test_near_and_far_are_ranges_from_the_camera(tmp_path):
     truth = scene()[0]
-    maps = solve(write(tmp_path / "c", cw_frames(tof.even((60e6, 80e6), 4), 3), SOURCE), near_m=0.5, far_m=1.3)
+    frames = cw_frames(tof.correlations(view(), 3e4, SETTINGS, seed=3), SETTINGS, source_m=SOURCE)
+    maps = solve(write(tmp_path / "c", frames, camera=CAMERA), near_m=0.5, far_m=1.3)
     clear = np.minimum(np.abs(truth - 1.3), np.abs(truth - 0.5)) > 0.015  # at least seven standard deviations
     outside = (truth > 1.3) | (truth < 0.5)
     assert np.mean(((maps.status == Status.OUT_OF_RANGE) == outside)[clear]) > 0.99  # at the rim of the ball σ reaches across the limit
@@ -79,7 +66,7 @@ def test_near_and_far_are_ranges_from_the_camera(tmp_path):
 def test_histograms_with_a_source(tmp_path):
     truth = scene()[0]
     counts = tof.histogram(view(), 4000, bins=40, bin_s=0.5e-9, sigma_s=0.4e-9, background=0.1, seed=4)
-    maps = solve(write(tmp_path / "p", [(counts, {"type": "pulsed", "bin_s": 0.5e-9, "start_s": 0.0})], SOURCE))
+    maps = solve(write(tmp_path / "p", pulsed_frames(counts, bin_s=0.5e-9, source_m=SOURCE), camera=CAMERA))
     error = (maps.range - truth)[maps.mask]
     assert maps.mask.mean() > 0.99 and np.abs(np.mean(error)) < 3e-4  # 2.5 mm too far without the source
 
