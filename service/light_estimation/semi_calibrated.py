@@ -14,7 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.grey_ball import WEIGHT_SCALE
-from service.light_estimation.lambertian import SHADOW, bright_readings, fit_lambertian, least_squares, normal_equations
+from service.light_estimation.lambertian import (
+    BRIGHT_END,
+    SHADOW,
+    bright_readings,
+    fit_lambertian,
+    least_squares,
+    median_of,
+    normal_equations,
+)
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -26,6 +34,11 @@ MIN_DETERMINED = 1e-3
 """The least relative singular value of the equations for the ambiguity: below it the brightness is not determined."""
 RIDGE = 1e-12
 """The part of the mean of its diagonal that is added to the normal equations of a pixel: pixels of no weight get no b."""
+GUESS_ROUNDS = 3
+"""Rounds of the first guess, each of which compares a light with the bright readings that the others then have."""
+UNLIT = 0.4
+"""Median relative error of the readings of a light from which it is dark: noise alone has 1 and more, a thirtieth of the others' light
+under noise of a sixteenth of its own .2."""
 ROUNDS = 60
 """The most rounds."""
 LINEAR_ROUNDS = range(6, 12)
@@ -153,7 +166,23 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
                                f"{MIN_PIXELS} are needed")
     reading, lit = reading[:, enough], lit[:, enough]
     reading = reading / np.where(lit, reading, 0).max(axis=0)  # so that pixels of dark albedo have the same weight
-    e, weight = np.ones(len(directions)), lit.astype(np.float64)
+    try:
+        e, b, weight = _rounds(reading, lit, directions, np.ones(len(directions)), rounds)
+    except _UnlitError:  # or far dimmer than the others
+        e, b, weight = _rounds(reading, lit, directions, _first_guess(reading, lit), rounds)
+        unlit = _off(reading, usable[:, enough], e, directions @ b) > UNLIT
+        if unlit.any():
+            raise _UnlitError(np.flatnonzero(unlit)) from None
+    error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
+    total = weight.sum(axis=1)
+    residual = np.sqrt((weight * error**2).sum(axis=1) / total)
+    return e, residual, count
+
+
+def _rounds(reading: np.ndarray, lit: np.ndarray, directions: np.ndarray, e: np.ndarray,
+            rounds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the irradiance [lights] that the rounds lead to from `e`, the vectors of the pixels, and the weights."""
+    weight = lit.astype(np.float64)
     for step in range(rounds):
         weight = _weights(reading, lit, e, directions, weight)
         unlit = (weight > 0).sum(axis=1) < MIN_PIXELS
@@ -167,10 +196,24 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
         e /= e.mean()
         if step >= LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
             break
-    error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
-    total = weight.sum(axis=1)
-    residual = np.sqrt((weight * error**2).sum(axis=1) / total)
-    return e, residual, count
+    return e, b, weight
+
+
+def _first_guess(reading: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Return the irradiance [lights] from the bright readings of each light, which pixels that face it have."""
+    e = np.ones(len(reading))
+    for _ in range(GUESS_ROUNDS):
+        scaled = np.where(lit, reading / e[:, None], 0)
+        scaled /= scaled.max(axis=0)
+        e *= [np.quantile(each[seen], BRIGHT_END) if seen.any() else 1.0 for each, seen in zip(scaled, lit, strict=True)]
+    return e / e.mean()
+
+
+def _off(reading: np.ndarray, usable: np.ndarray, e: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """Return the median relative error [lights] of the readings where the light should be seen, whatever their weight."""
+    seen = usable & (model > SHADOW * model.max(axis=0))
+    relative = np.abs(reading / (e[:, None] * np.where(seen, model, 1)) - 1)
+    return np.asarray(median_of(relative.T, seen.T))
 
 
 def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:

@@ -127,6 +127,22 @@ def test_a_light_that_nothing_shows_is_left_out_of_the_others():
         fit_intensities(readings[2:6], np.ones((4, readings.shape[1]), bool), directions[2:6])
 
 
+@pytest.mark.parametrize("part", [1 / 30, 1 / 10, 0])
+def test_a_dim_light_is_told_from_one_that_does_not_burn(part):
+    """Noise is a thousandth of the bright readings: a thirtieth is known to 3 % of itself a reading, and no pixel shows a dark light."""
+    directions, irradiance, readings, _ = scene(8, 0.8)
+    factor = np.where(np.arange(8) == 2, part * irradiance.mean() / irradiance[2].mean(), 1)[:, None]
+    noise = 1e-3 * np.quantile(readings, 0.99) * np.random.default_rng(1).standard_normal(readings.shape)
+    given = readings * factor[:, None] + noise, np.ones(readings.shape[:2], bool), directions
+    found = fit_intensities(*given)
+    burning = np.isfinite(found.irradiance).all(axis=1)
+    assert burning.tolist() == [number != 2 or part > 0 for number in range(8)]
+    true = (irradiance * factor)[burning]
+    off = np.abs(found.irradiance[burning] / (true / true.mean(axis=0)) - 1)
+    assert off.max() < 0.1 and np.delete(off, 2, axis=0).max() < 0.01
+    assert (off / part_uncertainty(*given, found.irradiance)[burning]).max() < 5
+
+
 def test_consistent_lights_are_no_suspects():
     noisy = READINGS * (1 + 0.02 * RNG.standard_normal(READINGS.shape))
     assert suspects(READINGS, LIGHTS, NORMAL) == [] and suspects(noisy, LIGHTS, NORMAL) == []
