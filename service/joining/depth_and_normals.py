@@ -45,6 +45,8 @@ class Joined(NamedTuple):
     """Standard deviation of errors that neighbouring depths share."""
     one_sided_m: float
     """By how much wrong depths that are too near to be rejected pull the surface to one side; 0 where it is not sure that they do."""
+    contradicted_degrees: float
+    """Median angle by which the smooth part of the depth turns the normals; 0 where errors as normals have them explain it."""
 
 
 def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
@@ -105,6 +107,13 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     # turned lights look like a shift where surfaces are round, but the correction takes them up, and not a shift
     shift_px = compare_relief(u - correction, u_sigma, base, known & (part == largest) & ~rejected, part).shift_px
     variance += _shifted(base, shift_px)
+    turn = _degrees(normal, plane.turned(normal.astype(np.float64), slopes, correction, part, solved))[placed]
+    contradicted = float(np.median(turn)) if turn.size else 0.0
+    if contradicted <= np.degrees(max(SLOPE_ERROR, float(np.median(normal_sigma[solved])))):
+        contradicted = 0.0
+    disputed = (1 - 1 / relief.factor) * base + (correction if contradicted else 0)
+    if placed.any():  # which of the two is right, and where their surfaces meet, is unknown
+        variance += (apart := (disputed - disputed[placed].mean()) ** 2) + apart[placed].mean()
     corrected = plane.turned(normal.astype(np.float64), slopes, correction + (1 - 1 / relief.factor) * base, part, solved)
     z = np.where(placed, plane.to_z(base + correction), 0)
     sigma = np.where(placed, plane.to_depth_sigmas(z, np.sqrt(variance)), 0)
@@ -112,9 +121,15 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     if unplaced.any():
         known_z = z[placed].mean() if placed.any() else mean_z
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
+    shared_m, one_sided_m = (float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided))
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
-                  *(float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided)))
+                  shared_m, one_sided_m, contradicted)
+
+
+def _degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the angles [rows, cols] between unit vectors [3, rows, cols]."""
+    return np.degrees(np.arccos(np.clip((one * other).sum(axis=0), -1, 1)))
 
 
 def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:

@@ -129,7 +129,7 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "normals_turned_degrees": {"median": _median(turned), "p95": round(float(np.percentile(turned, 95)), 4) if turned.size else 0.0},
         "parts": int(joined.part.max()) + 1,
         "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
-        "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
+        "contradicted_degrees": round(joined.contradicted_degrees, 2), "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
         "normals_factor": round(joined.relief.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.relief.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
     }
@@ -150,8 +150,14 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
         found.append(f"depth: its errors pull the surface to one side by some {facts['depth_one_sided_m']:.2g} m, as where many depths are "
                      "off alike and too near to be left out: height_sigma holds that")
     if facts["normals_factor"] != 1:
-        found.append(f"normals: the relief of the depth is {facts['normals_factor']:.3g} times theirs, which are "
-                     f"{'flat' if facts['normals_factor'] > 1 else 'steep'}: the joined ones have that of the depth")
+        flat = facts["normals_factor"] > 1
+        found.append(f"normals: the relief of the depth is {facts['normals_factor']:.3g} times theirs: they are too "
+                     f"{'flat' if flat else 'steep'}, or the depth is too {'deep' if flat else 'shallow'} (its scale or baseline); the "
+                     "joined ones have that of the depth, and height_sigma holds both")
+    if facts["contradicted_degrees"]:
+        found.append(f"depth and normals contradict each other by {facts['contradicted_degrees']:.2g}° in the median, smoothly: either the "
+                     "lights of the solve are off, or the depth is bent or tilted (as a range along the ray given as depth along the "
+                     "axis); the joined ones follow the depth, and height_sigma holds both")
     if any(facts["depth_shift_px"]):
         right, down = facts["depth_shift_px"]
         found.append(f"depth: it looks shifted by {right:+.2g} px to the right and {down:+.2g} px down against the normals, as where the "

@@ -52,6 +52,8 @@ class _Scan(NamedTuple):
     pose: np.ndarray | None  # [4, 4] world from scan
     converted: PointCloud | None = None
     """What is written to `path`; None: it is a file of the source."""
+    units_m: tuple[float, float, float] | None = None
+    """Metres in one unit of x, y and z as its file says; None: it does not."""
 
 
 def import_scans(request: ScansImport) -> Imported:
@@ -66,7 +68,7 @@ def import_scans(request: ScansImport) -> Imported:
         listed = natural_order(path.name for path in source.iterdir() if not path.name.startswith("."))
     names = [name for name in listed if name.lower().endswith(POINT_FILES)]
     metric = [name for name in names if name.lower().endswith(".e57")]
-    if metric and request.unit is not ScanUnit.M:
+    if metric and request.unit not in (None, ScanUnit.M):
         raise ManifestError(f"{source / metric[0]}: E57 files are in metres: leave --unit {request.unit} out, and import other files apart")
     layout, tables = frame_layout(source), [source / name for name in listed if name.lower().endswith(".conf")]
     converted = [name for name in names if not name.lower().endswith(".ply")]
@@ -96,20 +98,39 @@ def import_scans(request: ScansImport) -> Imported:
     placed = sum(scan.pose is not None for scan in scans)
     counts, sizes = [len(scan.points) for scan in scans], [float(np.ptp(scan.points, axis=0).max()) for scan in scans]
     facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
-             ("size", f"{max(sizes):.3g} m is the widest at --unit {request.unit}"),
+             ("size", f"{max(sizes):.3g} m is the widest at --unit {_unit(request)}"),
              ("poses", "not known" if not placed else f"{placed} from {'their files' if table is None else table}")]
+    facts += _units_said(request, scans)
     if moved is not None:
         facts.append(("origin", f"is moved to {','.join(f'{x:.0f}' for x in moved)} of the files, from which the points lie far away"))
     facts += _doubts(request, scans, sizes, any(name.lower().endswith(METRIC) for name in names))
     places = _viewpoints(request, scans, facts)
     entries = [ScanEntry.model_validate({
-        "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.converted is None else "m",
+        "name": scan.name, "path": scan.path, "unit": _unit(request).value if scan.converted is None else "m",
         **({} if place is None else {"viewpoint_m": place}),
         **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})})
         for scan, place in zip(scans, places, strict=True)]
     if folder != source:
         place_images(source, folder, [scan.path for scan in scans if scan.converted is None])
     return _written(request, entries, facts)
+
+
+def _unit(request: ScansImport) -> ScanUnit:
+    """Return the unit of coordinates whose file does not say it."""
+    return request.unit or ScanUnit.M
+
+
+def _units_said(request: ScansImport, scans: list[_Scan]) -> list[tuple[str, str]]:
+    """Return what is said about scans whose files say another unit than `_unit`."""
+    said: dict[tuple[float, float, float], list[str]] = {}
+    for scan in scans:
+        if scan.units_m is not None and not np.allclose(scan.units_m, UNITS_M[_unit(request).value], rtol=1e-9, atol=0):
+            said.setdefault(scan.units_m, []).append(scan.name)
+    facts = []
+    for (across, _, up), names in said.items():
+        words = f"the unit of {', '.join(names)} is {across:.9g} m{f', of heights {up:.9g} m' if up != across else ''}, as the files say"
+        facts.append(("unit", words) if request.unit is None else ("warning", f"{words}, and --unit {request.unit} is taken"))
+    return facts
 
 
 def _refuse_unused(request: ScansImport, what: str, taken: dict[str, str]) -> None:
@@ -159,7 +180,7 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
 
     Coordinates on a map are too large for floats of 32 bits: a PLY file with doubles is written anew.
     """
-    unit, moved, stems = UNITS_M[request.unit.value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
+    unit, moved, stems = UNITS_M[_unit(request).value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
     found = []
 
     def shift_of(points: np.ndarray, pose: np.ndarray | None) -> np.ndarray:
@@ -185,8 +206,9 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
         parts = read_point_scans(request.source / name)
         for number, part in enumerate(parts, start=1):
             _check_points(request.source / name, part.points)
-            shift = shift_of(part.points, part.pose)
-            points = (part.points - shift) * unit
+            in_unit = part.points if request.unit is not None or part.units_m is None else part.points * part.units_m
+            shift = shift_of(in_unit, part.pose)
+            points = (in_unit - shift) * unit
             unique = stem if len(parts) == 1 else f"{stem}-{number}"
             while unique in stems:
                 unique += "-" + Path(name).suffix[1:].lower()
@@ -195,7 +217,7 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
             place = None if part.viewpoint is None else (part.viewpoint - shift) * unit
             colours = _grey(points) if part.colours is None else part.colours
             converted = PointCloud(points.astype(np.float32), colours, part.normals)
-            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted))
+            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted, part.units_m))
     return found, moved
 
 
@@ -229,8 +251,8 @@ def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric
                                 f"{sizes[smallest]:.3g} m: are they in one unit? import those of another unit apart"))
     elif not metric and not SMALL_M < sizes[largest] < LARGE_M:
         others = " or ".join(f"{unit} ({size:.3g} m)" for unit, metres in UNITS_M.items()
-                             if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[request.unit.value]) <= USUAL_M[1])
-        said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {request.unit}? "
+                             if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[_unit(request).value]) <= USUAL_M[1])
+        said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {_unit(request)}? "
                                 f"give --unit{others and f', which may be {others}'}"))
     for scan in scans:
         step = float(np.spacing(np.float32(np.abs(scan.points).max())))

@@ -9,6 +9,7 @@ import numpy as np
 
 from stage.errors import ResultError
 from stage.files import replacing
+from stage.formats.las_units import units_of
 
 LAS_FILE = "points.las"
 POINT_FORMAT = 6
@@ -26,6 +27,15 @@ NOISE_CLASSES = (7, 18)
 COORDINATES = ('LOCAL_CS["world of the scan",LOCAL_DATUM["world of the scan",0],UNIT["metre",1],'
                'AXIS["x",OTHER],AXIS["y",OTHER],AXIS["z",OTHER]]')
 """The coordinate system, which LAS 1.4 requires: coordinates are in the world frame of the track of the platform, not on a map."""
+
+
+class LasPoints(NamedTuple):
+    """The points of a file."""
+
+    points: np.ndarray  # [n, 3] float64, in the units of the file
+    colours: np.ndarray | None  # [n, 3] uint8
+    units_m: tuple[float, float, float] | None
+    """Metres in one unit of x, y and z; None: the file does not say it."""
 
 
 class LasScales(NamedTuple):
@@ -99,10 +109,9 @@ def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.nda
     return number, counts[group]
 
 
-def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
+def read_las(path: str | Path) -> LasPoints:
     """Read the points of a LAS or LAZ file, but those that are withheld or classified as noise.
-    Raises ResultError if laspy is not installed, or the file is no LAS file, or a part of one.
-    Returns points: [n, 3] float64, in the unit of the file. colours: [n, 3] uint8, or None."""
+    Raises ResultError if laspy is not installed, or the file is no LAS file, or a part of one."""
     if not las_is_installed():
         raise ResultError(f"{path}: LAS files need laspy: pip install 'relit[las]'")
     import laspy
@@ -115,10 +124,11 @@ def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise ResultError(f"{path}: is no LAS file that laspy reads: {' '.join(str(error).split())}") from error
     if len(cloud.points) != promised:
         raise ResultError(f"{path}: is truncated: it holds {len(cloud.points)} of {promised} points")
+    units_m = units_of([*cloud.header.vlrs, *(cloud.evlrs or [])])
     cloud = cloud[(np.asarray(cloud.withheld) == 0) & ~np.isin(np.asarray(cloud.classification), NOISE_CLASSES)]
     points = np.stack([np.asarray(cloud[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     names = set(cloud.point_format.dimension_names)
     if not {"red", "green", "blue"} <= names:
-        return points, None
+        return LasPoints(points, None, units_m)
     colours = np.stack([np.asarray(cloud[name]) for name in ("red", "green", "blue")], axis=1)
-    return points, (colours >> (8 if colours.max(initial=0) > 255 else 0)).astype(np.uint8)
+    return LasPoints(points, (colours >> (8 if colours.max(initial=0) > 255 else 0)).astype(np.uint8), units_m)

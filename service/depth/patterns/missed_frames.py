@@ -1,4 +1,4 @@
-"""Frames that do not show their pattern: dark or even where stripes are declared, or once more the picture before.
+"""Frames that do not show their pattern: dark or even where stripes are declared, once more the picture before, or copies of another.
 
 A projector that misses a picture, or a camera that is triggered too late, leaves them. One bit is then the same everywhere, or that of
 another frame, and stripes far from each other are taken for one.
@@ -54,6 +54,14 @@ def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], 
                 and (np.abs(grey[row] - grey[row - 1]) < near).mean() >= EVEN):
             return (f"frames: {frames[row].image} and {frames[row - 1].image} show the same, and other patterns are declared: the "
                     "projector has missed one, or the camera was too early or late; take the sequence again")
+    apart = {row for code in collected.codes if isinstance(code, BinaryCode) and code.name != "gray"  # in pictures without noise
+             for row in (*code.frames, *(code.inverses or ()))}
+    earlier: dict[bytes, int] = {}
+    for row in (int(row) for row in np.flatnonzero(stripes) if row not in apart):
+        same = earlier.setdefault(sample.values[row][:, lit].tobytes(), row)
+        if frames[row].pattern != frames[same].pattern:
+            return (f"frames: {frames[row].image} and {frames[same].image} are the same to the last bit, and other patterns are declared: "
+                    "one is a copy of the other; import the images again, or take the sequence again")
     return None
 
 

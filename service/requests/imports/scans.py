@@ -24,8 +24,8 @@ class ScansImport(ImportRequest):
     """Point files (PLY, PTX, PTS, PCD, XYZ, LAS, E57) of one object scanned from several places, whose scanner is found, the frames of a
     depth camera, or folders with results of relit depth, as a scan set."""
 
-    unit: ScanUnit = ScanUnit.M
-    """The unit of the coordinates."""
+    unit: ScanUnit | None = None
+    """The unit of the coordinates; None: that which a LAS file says, else m."""
     viewpoint_m: Annotated[tuple[Finite, Finite, Finite] | None, Commas, Spelling(flag="--viewpoint", metavar="X,Y,Z")] = None
     """Where the scanner stood in the frame of every scan, metres; None: it is estimated."""
     poses: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None

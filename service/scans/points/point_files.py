@@ -34,6 +34,7 @@ class PointScan(NamedTuple):
     normals: np.ndarray | None = None  # [n, 3] float32
     viewpoint: np.ndarray | None = None  # [3] of the scanner, in the frame of the points; None: the file does not say it
     pose: np.ndarray | None = None  # [4, 4] world from scan, as the file has it; None: the file does not say it
+    units_m: tuple[float, float, float] | None = None  # metres in one unit of x, y and z; None: the file does not say it
 
 
 def read_point_scans(path: Path) -> list[PointScan]:
@@ -129,8 +130,8 @@ def _pcd(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
 
 
 def _las(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
-    points, colours = read_las(path)
-    yield PointScan(points, colours)
+    points, colours, units_m = read_las(path)
+    yield PointScan(points, colours, units_m=units_m)
 
 
 def _e57(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:

@@ -104,6 +104,25 @@ def test_normals_that_are_too_flat_or_too_steep_everywhere_get_the_relief_of_the
     assert degrees_between(joined.normal, WAVE.normal).mean() < 1.2  # 1.1° of noise and drift were given
 
 
+@pytest.mark.parametrize(("wrong", "said"), [(False, False), (True, True)], ids=["depth along the axis", "range along the ray"])
+def test_a_bent_depth_that_contradicts_the_normals_is_said_and_held(device, wrong, said):
+    """A range along the ray bends the surface by 8° in the mean: 70 % of the heights were more than 5 σ off."""
+    view = see("wave", perspective=True)
+    depth = -view.z * (np.sqrt(1 + view.x**2 + view.y**2) if wrong else 1)
+    joined, _ = join(view, noise=0.5, drift=1, sigma=SIGMA, device=device,
+                     depth=depth + SIGMA * np.random.default_rng(1).standard_normal(depth.shape))
+    assert (joined.contradicted_degrees > 0) == said
+    assert np.mean(np.abs(joined.height - view.z) > 5 * joined.sigma) < 0.01
+    assert said or np.median(joined.sigma) < 0.2 * SIGMA
+
+
+def test_a_relief_that_is_too_deep_is_held(device):
+    depth = 0.5 + 1.15 * (-WAVE.z - 0.5) + SIGMA * np.random.default_rng(1).standard_normal(WAVE.z.shape)
+    joined, _ = join(WAVE, noise=0.5, drift=1, sigma=SIGMA, device=device, depth=depth)
+    assert joined.relief.factor == pytest.approx(1.15, rel=0.03)
+    assert np.mean(np.abs(joined.height - WAVE.z) > 5 * joined.sigma) < 0.01  # 63 % before
+
+
 def test_normals_that_are_turned_alike_are_not_taken_for_a_shifted_depth(device):
     """An egg whose normals are turned by 5° looks as if it stood 1.7 px aside; the depth turns them back."""
     made = surface("egg", np.random.default_rng(0))

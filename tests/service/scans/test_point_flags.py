@@ -8,6 +8,7 @@ from pye57 import libe57
 
 from service.scans.points.point_files import read_point_scans
 from stage.errors import ResultError
+from stage.formats.ply import read_ply
 
 POINTS = np.random.default_rng(0).random((20, 3))
 COLOURS = np.arange(60, dtype=np.uint8).reshape(20, 3) * 4
@@ -65,3 +66,44 @@ def test_colours_of_e57_files_have_the_scale_of_the_file(most, tmp_path):
     file.close()
     found, = read_point_scans(tmp_path / "a.e57")
     assert found.colours.dtype == np.uint8 and np.array_equal(found.colours, COLOURS)
+
+
+FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
+GEOGRAPHIC = 'GEOGCS["WGS 84",DATUM["x",SPHEROID["y",6378137,298.25]],PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]'
+
+
+def geo_keys(**values):
+    record = laspy.vlrs.known.GeoKeyDirectoryVlr()
+    record.geo_keys = [laspy.vlrs.known.GeoKeyEntryStruct(number, 0, 1, value) for number, value in
+                       ((3072, 2263), *((int(name[1:]), value) for name, value in values.items()))]
+    record.geo_keys_header.number_of_keys = len(record.geo_keys)
+    return record
+
+
+def wkt(text):
+    return laspy.vlrs.known.WktCoordinateSystemVlr(text)
+
+
+@pytest.mark.parametrize(("record", "units"), [
+    (wkt(f'PROJCS["New York (ftUS)",{GEOGRAPHIC},PARAMETER["false_easting",984250],UNIT["US survey foot",0.3048006096012192],'
+         'AXIS["X",EAST]]'), [SURVEY_FOOT] * 3),
+    (wkt(f'COMPD_CS["a [both]",PROJCS["b",{GEOGRAPHIC},UNIT["foot",0.3048]],VERT_CS["c",VERT_DATUM["d",2005],UNIT["metre",1.0]]]'),
+     [FOOT, FOOT, 1]),
+    (wkt('PROJCRS["e",BASEGEOGCRS["f",DATUM["g",ELLIPSOID["h",6378137,298,LENGTHUNIT["metre",1]]]],CONVERSION["i",PARAMETER["j",0,'
+         'LENGTHUNIT["metre",1]]],CS[Cartesian,2],AXIS["(E)",east,LENGTHUNIT["foot",0.3048]],AXIS["(N)",north,LENGTHUNIT["foot",0.3048]]]'),
+     [FOOT] * 3),
+    (wkt(f'PROJCS["UTM",{GEOGRAPHIC},UNIT["metre",1]]'), [1] * 3), (geo_keys(k3076=9003), [SURVEY_FOOT] * 3),
+    (geo_keys(k3076=9002, k4099=9001), [FOOT, FOOT, 1]), (geo_keys(k3076=9001), [1] * 3), (geo_keys(), [1] * 3), (None, [1] * 3)])
+def test_las_files_in_feet_become_metres(relit, tmp_path, record, units):
+    """Coordinate systems in feet, of which some have heights in metres, beside those in metres and files that say nothing."""
+    (tmp_path / "in").mkdir()
+    path = las(tmp_path / "in" / "a.las", 7)
+    cloud = laspy.read(path)
+    if record is not None:
+        cloud.header.vlrs.append(record)
+        cloud.write(str(path))
+    said = relit.done("import", "scans", tmp_path / "in", tmp_path / "out").out
+    np.testing.assert_allclose(read_ply(tmp_path / "out" / "a.ply").points, POINTS * units, atol=1e-6)  # steps of the file, float32
+    assert ("as the files say" in said) == (units != [1] * 3)
+    said = relit.done("import", "scans", tmp_path / "in", tmp_path / "given", "--unit", "cm").out
+    np.testing.assert_allclose(read_ply(tmp_path / "given" / "a.ply").points, POINTS * 0.01, atol=1e-8)  # the given unit holds

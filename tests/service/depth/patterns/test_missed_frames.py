@@ -1,6 +1,7 @@
 """Frames that the projector missed are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
 
 import json
+from shutil import copyfile
 
 import numpy as np
 import pytest
@@ -28,22 +29,24 @@ def scene():
     return make_scene()
 
 
-def measured(folder, scene, patterns, *, dark=(), again=(), columns=None):
-    """What relit depth says of frames of which some are dark, and some show once more what the frame before shows, and what it makes of
-    some columns of them."""
+def measured(folder, scene, patterns, *, dark=(), again=(), copies=None, columns=None, noise=NOISE):
+    """What relit depth says of frames of which some are dark, some show once more what the frame before shows, and some are the files of
+    others, and what it makes of some columns of them."""
     rng = np.random.default_rng(4)
     frames, before = [], np.zeros(scene.depth.shape)
     for number, pattern in enumerate(patterns):
         before = before if number in again else shown(pattern, scene.uv) * (number not in dark)
         image = scene.albedo[..., 1] * (0.8 * before * ~scene.shaded + AMBIENT)
-        write_exr(folder / f"{number:02d}.exr", np.repeat((image + rng.normal(0, NOISE, image.shape))[..., None], 3, axis=-1))
+        write_exr(folder / f"{number:02d}.exr", np.repeat((image + noise * rng.normal(0, 1, image.shape))[..., None], 3, axis=-1))
         frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
+    for number, source in (copies or {}).items():
+        copyfile(folder / f"{source:02d}.exr", folder / f"{number:02d}.exr")
     mask = np.zeros(scene.depth.shape, np.uint8)
     mask[:, columns or slice(None)] = 255
     write_image(folder / "mask.png", mask)
     (folder / "capture.json").write_text(json.dumps(manifest(frames, mask="mask.png")))
     result = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
-    return [warning for warning in result.warnings if "missed" in warning], result.maps.mask
+    return [warning for warning in result.warnings if "missed" in warning or "copy" in warning], result.maps.mask
 
 
 @pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 1), (NUMBERED, 7), (INVERSES, 8), (INVERSES, 3), (PLAIN, 5), (WAVES, 4),
@@ -60,6 +63,22 @@ def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
 def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, patterns, number):
     said, solved = measured(tmp_path, scene, patterns, again=[number])
     assert f"{number:02d}.exr and {number - 1:02d}.exr show the same" in said[0] and not solved.any()
+
+
+@pytest.mark.parametrize(("patterns", "copies"), [(INVERSES, {6: 4, 7: 5}), (INVERSES, {8: 2, 9: 3}), (INVERSES, {7: 5, 6: 4, 8: 4, 9: 5}),
+                                                   (PLAIN, {6: 4}), (KARY, {5: 3})],
+                         ids=["pair", "pair of an earlier one", "two pairs", "bit", "digit"])
+def test_copies_of_earlier_frames_are_named(tmp_path, scene, patterns, copies):
+    said, solved = measured(tmp_path, scene, patterns, copies=copies)
+    number = min(copies)
+    assert f"{number:02d}.exr and {copies[number]:02d}.exr are the same" in said[0] and not solved.any()
+
+
+@pytest.mark.parametrize("patterns", [INVERSES, PLAIN, BINARY, XOR, WAVES, KARY, NUMBERED],
+                         ids=["inverses", "without inverses", "binary", "XOR", "waves", "digits", "numbered"])
+def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
+    said, solved = measured(tmp_path, scene, patterns, columns=slice(30, 50), noise=0)
+    assert not said and solved.any()
 
 
 @first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
