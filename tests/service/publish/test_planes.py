@@ -45,7 +45,7 @@ def test_each_light_is_shown_as_the_basis_has_it(relit, tmp_path, owl):
     """The dome's 32 lights and the sample's 47: OpenLIME shows each within 2 levels of the components before bytes and JPEG files."""
     folder = SAMPLES / "owl" if owl else tmp_path / "dome"
     lights, truth = sample(folder) if owl else dome(folder)
-    relit.done("publish", folder, "--to", tmp_path / "out", "--as", "openlime")
+    relit.done("publish", folder, "--to", tmp_path / "out", "--as", "openlime", "--cache", tmp_path / "cache")
     for tiles in (False, True):
         found = np.rint(255 * shown(tmp_path / "out", lights, tiles=tiles)) / 255  # as a canvas has it
         assert levels_rms(found, truth).max() < 2
