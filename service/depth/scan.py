@@ -31,6 +31,9 @@ from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 USD_FILE = "points.usdc"
 MOST_RETURNS = 4
 """Returns that are looked for in a waveform."""
+MOST_STEP_M = 1e-3
+"""Distance between floats of 32 bits, metres, above which points are counted from among them: scanners measure to millimetres. It is
+reached 16 km from the origin, as on a map."""
 
 
 class ScanResult(NamedTuple):
@@ -77,14 +80,22 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     counts = {"shots": len(shots.time_s), "with_points": shots_used, "points": len(points),
               "out_of_range": int((~inside).sum()), "outside_track": int((~covered).sum())}
     colours = srgb_bytes(np.repeat(intensity[None, :, None], 3, axis=2), white_of(intensity), "lin_rec709_scene")[0]
-    cloud = PointCloud(points.astype(np.float32), colours, intensity=intensity.astype(np.float32))
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    origin = np.rint(points.mean(axis=0)) if step > MOST_STEP_M else np.zeros(3)
+    cloud = PointCloud((points - origin).astype(np.float32), colours, intensity=intensity.astype(np.float32))
+    place = ",".join(f"{x:.0f}" for x in origin)
+    if origin.any():
+        facts["origin_m"] = origin.tolist()
+        warnings.append(f"the track lies so far from its origin that floats of 32 bits hold points to {step:.2g} m only: {POINTS_FILE} and "
+                        f"{USD_FILE} are counted from {place}{f', {LAS_FILE} is not' if request.las else ''}")
     timings.stage("write", 1)
     names = [FILE_NAME, shots.scan.shots, *(() if shots.scan.waveforms is None else (shots.scan.waveforms.file,))]
     hashes = Fingerprints(shots.folder, request.out / "files.json").of(names)
     sources = metadata(request, capture=shots.scan.name, inputs=" ".join(hashes[name] for name in names), method="scan")
+    counted = sources | ({"relit:origin_m": place} if origin.any() else {})
     points_path, usd_path, report_path = (request.out / name for name in (POINTS_FILE, USD_FILE, REPORT_FILE))
-    write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
-    write_points(cloud, usd_path, name=shots.scan.name, provenance=sources)
+    write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in counted.items()))
+    write_points(cloud, usd_path, name=shots.scan.name, provenance=counted)
     las_path = None
     if request.las:
         las_path = request.out / LAS_FILE

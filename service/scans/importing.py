@@ -54,6 +54,8 @@ class _Scan(NamedTuple):
     """What is written to `path`; None: it is a file of the source."""
     units_m: tuple[float, float, float] | None = None
     """Metres in one unit of x, y and z as its file says; None: it does not."""
+    step_m: float = 0.0
+    """Metres between the floats of 32 bits that hold the farthest points; 0: they are held by finer numbers, or counted from among them."""
 
 
 def import_scans(request: ScansImport) -> Imported:
@@ -87,7 +89,7 @@ def import_scans(request: ScansImport) -> Imported:
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
-    if folder == source and moved is not None:
+    if folder == source and any(scan.converted is not None for scan in scans):
         raise ManifestError(f"{source}: its points lie far from the origin, and are counted from among them: give another folder for the "
                             "scans")
     _angles(request, len(scans))
@@ -100,6 +102,11 @@ def import_scans(request: ScansImport) -> Imported:
     facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
              ("size", f"{max(sizes):.3g} m is the widest at --unit {_unit(request)}"),
              ("poses", "not known" if not placed else f"{placed} from {'their files' if table is None else table}")]
+    if request.viewpoint_m is None and _in_one_frame(scans):
+        scans = [scan._replace(viewpoint=None) for scan in scans]
+        facts.append(("poses", "are all the identity, and the scans do not look seen from their origin: they are taken to lie in one "
+                               "frame, seen from elsewhere; if each is in the frame of its scanner, give --viewpoint 0,0,0, and relit "
+                               "register --poses ignored"))
     facts += _units_said(request, scans)
     if moved is not None:
         facts.append(("origin", f"is moved to {','.join(f'{x:.0f}' for x in moved)} of the files, from which the points lie far away"))
@@ -178,30 +185,35 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
     """Return the scans, of which those of other files than PLY are to be written, and the place in the files that becomes the origin, or
     None.
 
-    Coordinates on a map are too large for floats of 32 bits: a PLY file with doubles is written anew.
+    Coordinates on a map are too large for floats of 32 bits: a PLY file with doubles is written anew. Of scans with poses the points are
+    counted from among them in the frame of the scan, where the scanner then does not stand, and the poses from among their places.
     """
     unit, moved, stems = UNITS_M[_unit(request).value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
     found = []
 
     def shift_of(points: np.ndarray, pose: np.ndarray | None) -> np.ndarray:
         nonlocal moved
-        if moved is None and pose is None and np.abs(points).max() > FAR_AWAY * np.ptp(points, axis=0).max():
-            moved = np.rint(points.mean(axis=0))
-        return np.zeros(3) if moved is None or pose is not None else moved
+        middle = np.rint(points.mean(axis=0)) if np.abs(points).max() > FAR_AWAY * np.ptp(points, axis=0).max() else None
+        if pose is not None:
+            return np.zeros(3) if middle is None else middle
+        moved = middle if moved is None else moved
+        return np.zeros(3) if moved is None else moved
 
     for name in names:
         stem = Path(name).stem
         if name.lower().endswith(".ply"):
             cloud = read_ply_points(request.source / name)
-            pose = None if name not in poses else _in_metres(poses[name], unit)
+            pose = poses.get(name)
             _check_points(request.source / name, cloud.points)
             doubles = bool((cloud.points != cloud.points.astype(np.float32)).any())
             shift = shift_of(cloud.points, pose) if doubles else np.zeros(3)
+            pose = None if pose is None else _in_metres(pose, shift, unit)
             points = (cloud.points - shift) * unit
             converted = None if not shift.any() else PointCloud(
                 points.astype(np.float32), _grey(points) if cloud.colours is None else cloud.colours, cloud.normals,
                 sigma=None if cloud.sigma is None else cloud.sigma * unit, confidence=cloud.confidence)
-            found.append(_Scan(stem, name, points, cloud.normals, None, pose, converted))
+            found.append(_Scan(stem, name, points, cloud.normals, None, pose, converted,
+                               step_m=_step(cloud.points) * unit if converted is None else 0.0))
             continue
         parts = read_point_scans(request.source / name)
         for number, part in enumerate(parts, start=1):
@@ -213,12 +225,40 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
             while unique in stems:
                 unique += "-" + Path(name).suffix[1:].lower()
             stems.add(unique)
-            pose = None if part.pose is None else _in_metres(part.pose, unit)
-            place = None if part.viewpoint is None else (part.viewpoint - shift) * unit
+            pose = None if part.pose is None else _in_metres(part.pose, shift, unit)
+            place = None if part.viewpoint is None or (pose is not None and shift.any()) else (part.viewpoint - shift) * unit
             colours = _grey(points) if part.colours is None else part.colours
             converted = PointCloud(points.astype(np.float32), colours, part.normals)
-            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted, part.units_m))
+            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted, part.units_m,
+                               _step(part.points) * unit if _floats(part.points) else 0.0))
+    places = np.array([scan.pose[:3, 3] for scan in found if scan.pose is not None]).reshape(-1, 3)
+    if moved is None and len(places) and np.abs(places).max() > FAR_AWAY * max(
+            np.ptp(places, axis=0).max(), *(np.ptp(scan.points, axis=0).max() for scan in found)):
+        moved = np.rint(places.mean(axis=0) / unit)
+    for scan in found:
+        if scan.pose is not None and moved is not None:
+            scan.pose[:3, 3] -= moved * unit
     return found, moved
+
+
+def _in_one_frame(scans: list[_Scan]) -> bool:
+    """Return whether all poses are the identity, which programs write too for scans that they have moved into one frame, and the scans
+    look seen from elsewhere than their origin, where their files put the scanner."""
+    if len(scans) < 2 or any(scan.viewpoint is None or scan.pose is None or (scan.pose != np.eye(4)).any() for scan in scans):
+        return False
+    found = find_viewpoints([scan.points for scan in scans], [scan.normals for scan in scans]).place
+    return found is not None and bool(found.any())
+
+
+def _step(points: np.ndarray) -> float:
+    """Return the distance between floats of 32 bits at the farthest of points [n, 3], in their unit."""
+    return float(np.spacing(np.float32(np.abs(points).max())))
+
+
+def _floats(points: np.ndarray) -> bool:
+    """Return whether points [n, 3] were floats of 32 bits, also if they were written with nine digits."""
+    near = points.astype(np.float32)
+    return bool((np.abs(points - near) <= 0.05 * np.spacing(np.abs(near))).all())
 
 
 def _grey(points: np.ndarray) -> np.ndarray:
@@ -234,10 +274,10 @@ def _check_points(path: Path, points: np.ndarray) -> None:
         raise ResultError(f"{path}: holds {different} different point{'s' * (different != 1)}: a surface has {LEAST_POINTS} or more")
 
 
-def _in_metres(pose: np.ndarray, unit: float) -> np.ndarray:
-    """Return a pose [4, 4] whose translation is in a unit of so many metres."""
+def _in_metres(pose: np.ndarray, shift: np.ndarray, unit: float) -> np.ndarray:
+    """Return a pose [4, 4], whose translation is in a unit of so many metres, of points that are counted from a place [3] in that unit."""
     found = pose.copy()
-    found[:3, 3] *= unit
+    found[:3, 3] = unit * (pose[:3, 3] + nearest_rigid(pose)[:3, :3] @ shift)
     return found
 
 
@@ -255,10 +295,9 @@ def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric
         said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {_unit(request)}? "
                                 f"give --unit{others and f', which may be {others}'}"))
     for scan in scans:
-        step = float(np.spacing(np.float32(np.abs(scan.points).max())))
-        if scan.converted is None and step > COARSE * np.ptp(scan.points, axis=0).max():
-            said.append(("warning", f"{scan.name} lies so far from the origin that floats of 32 bits hold its points to {step:.2g} m only: "
-                                    "export it with doubles, or with an origin near it"))
+        if scan.step_m > COARSE * np.ptp(scan.points, axis=0).max():
+            said.append(("warning", f"{scan.name} lies so far from the origin that floats of 32 bits hold its points to {scan.step_m:.2g} "
+                                    "m only: export it with doubles, or with an origin near it"))
     off = max((off_rotation(scan.pose) for scan in scans if scan.pose is not None), default=0.0)
     if off > ROTATION_ROUNDING:
         said.append(("turned", f"rotations were off orthonormal by up to {off:.1g}: the nearest are taken"))

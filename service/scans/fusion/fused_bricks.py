@@ -30,6 +30,10 @@ from service.sharing.sharing import digest, kind_of_worker
 from stage.formats.npy import packed, unpacked
 from stage.sets.scan_set import read_scan_set
 
+MOST_STEP = 0.1
+"""Voxels between neighbouring floats of 32 bits where the scans are, in which the mesh is written: a vertex is good to some hundredths of
+a voxel."""
+
 
 class FusedBricks(NamedTuple):
     """Results of the finished phases."""
@@ -81,6 +85,10 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     summaries = [ScanSummary.unpacked(content(piece)) for piece in numbers]
     names = tuple(name for name in WIDTHS if any(name in summary.names for summary in summaries))
     voxel = request.voxel_m or _voxel(summaries)
+    far = max(float(np.abs(summary.centre).max()) for summary in summaries)
+    if (step := float(np.spacing(np.float32(far)))) > MOST_STEP * voxel:
+        raise RequestError(f"{file}: scans[].scan_to_world: scans lie {far:.3g} m from the origin, where the floats of a mesh hold places "
+                           f"to {step:.2g} m only: subtract one place from the translations of all poses")
     known = digest([np.frombuffer(summary.packed(), dtype=np.uint8) for summary in summaries])
 
     timings.stage("compare", len(scans))

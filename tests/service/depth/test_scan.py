@@ -46,6 +46,19 @@ def test_a_turn_of_shots_is_a_ring(tmp_path):
     assert report["shots"]["with_points"] == 358
 
 
+def test_points_on_a_map_are_counted_from_among_them(tmp_path):
+    """Floats of 32 bits would hold them to half a metre."""
+    place = [500123.5, 5400321.25, 312.0]
+    track = [{"time_s": 0, "world_from_platform": [[*row, x] for row, x in zip(np.eye(3).tolist(), place, strict=True)] + [[0, 0, 0, 1]]}]
+    result = scan(ScanRequest(scan=write(tmp_path, ring(), track=track), out=tmp_path / "out", device="cpu", las=True))
+    origin = np.array(json.loads(result.report_path.read_text())["found"]["origin_m"])
+    assert np.linalg.norm(read_ply(result.points_path).points + (origin - place), axis=1) == pytest.approx(5.0, abs=1e-6)
+    assert np.linalg.norm(laspy.read(result.las_path).xyz - place, axis=1) == pytest.approx(5.0, abs=1e-4)  # its steps
+    assert result.warnings == (f"the track lies so far from its origin that floats of 32 bits hold points to 0.5 m only: points.ply and "
+                               f"points.usdc are counted from {','.join(f'{x:.0f}' for x in origin)}, points.las is not",)
+    assert b"relit:origin_m" in result.points_path.read_bytes()
+
+
 def test_the_asset_is_a_component_without_a_finding(tmp_path):
     nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
     shots = ring()

@@ -21,6 +21,9 @@ from tests.service.scans.mesh_files import read_faces
 VOXEL = 4e-3
 OFF = 5e-3
 """By how far one scan is put beside its place."""
+ON_MAP = np.zeros((4, 4))
+ON_MAP[:3, 3] = 450123, 5201234, 431
+"""Metres from a statue at the origin to one in coordinates of a map."""
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +143,8 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
             scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
     around = shots[::6]
     inverted = write_scans(tmp_path, around, poses=[np.linalg.inv(shot.world_from_camera) for shot in around])
+    on_map = write_scans(tmp_path / "map", shots[:2], poses=[shot.world_from_camera + ON_MAP for shot in shots[:2]])
+    refused("scans lie 5.2e[+]06 m from the origin, where the floats of a mesh hold places to 0.5 m only: subtract one", scan_set=on_map)
     refused(f"no two of the {len(around)} scans have a surface in common: look whether the poses are world_to_scan", scan_set=inverted)
     assert not (tmp_path / "out").exists()
 
