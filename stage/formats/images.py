@@ -284,6 +284,8 @@ def _check_suffix(path: str | Path) -> None:
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:
     if {"R", "G", "B"} <= set(names):
         return ("R", "G", "B")
+    if {"X", "Y", "Z"} <= set(names) or "RY" in names or "BY" in names:
+        raise ImageError(f"{path}: has channels {', '.join(names)}, of which Y alone is grey: convert its colours to R, G, B")
     if "Y" in names:
         return ("Y",)
     flat = [name for name in names if name != "A"]
