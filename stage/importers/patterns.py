@@ -124,6 +124,10 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
         if rest or not each:
             raise ManifestError(f"{source}: --gray-images {gray_images} names {len(names)} images, which is not equally many for each axis"
                                 + (" and inverse" if gray is None or gray.inverses != "none" else ""))
+        least = min((*phase.periods_px, *(phase.row_periods_px or ()))) if len(phase.periods_px) == 1 else math.inf
+        if gray_stripe_px is not None and gray_stripe_px > least:
+            raise ManifestError(f"--gray-stripe {gray_stripe_px:g}: stripes wider than the period of {least:g} px do not number its waves: "
+                                "give the width of the finest stripe of the Gray code in projector pixels")
         entries: list[Entry] = []
         for axis in phase.axes:
             inverses, fine_first = ("none", False) if gray is None else (gray.inverses, gray.fine_first)

@@ -89,8 +89,7 @@ def _image(path: Path, contents: GlbContents, number: int) -> dict[str, Any]:
             data = b""
         return {"file": name, **image_facts(data, f"{name}.{kind}")}
     if image.bufferView is None:
-        file = path.parent / unquote(image.uri or "")
-        return {"file": name, **(image_facts(file.read_bytes(), file.name) if file.is_file() else {})}
+        return {"file": name}
     view = contents.document.bufferViews[image.bufferView]
     with open(path, "rb") as stream:
         stream.seek(contents.data_start + (view.byteOffset or 0))

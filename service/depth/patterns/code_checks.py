@@ -341,7 +341,7 @@ def _compare_wave(phasors: np.ndarray, place: np.ndarray, period: float, *, wide
     if abs(best + 1 / period) * span < 0.5:
         return "run against the stripes: check step, whose order is reversed,"
     if abs(declared) < AS_DECLARED[wide] * strength or abs(own) < abs(offset) / 2:
-        return f"look like waves of {1 / abs(best):.4g} px{' that run against the stripes' if best < 0 else ''}: check period_px"
+        return f"look like waves of {1 / abs(best):.4g} px{' against the stripes' if best < 0 else ''}: check period_px, and stripe_px"
     return f"are offset by {offset:+.2g} periods against the stripes: check step and offset_rad"
 
 

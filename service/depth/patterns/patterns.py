@@ -33,6 +33,7 @@ from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
 from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.unseen_stripes import measured_edge_error, unseen_digits, unseen_sentences
 from service.depth.patterns.wave_checks import bent_back, check_waves
+from service.depth.patterns.wave_order import check_order
 from service.depth.patterns.wave_range import check_range
 from service.errors import RequestError
 from service.reporting.progress import Timings
@@ -188,8 +189,9 @@ def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, proje
              frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
     """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels and ramps are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
-    wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
-             else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
+    wrong = check_order(sample, codes.collected, noise) or (
+        check_unevenness(sample, patterns, shown, noise, device) if projector is None
+        else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)
     wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, measured)
     wrong = wrong or check_ramps(sample, codes.collected, shown, measured)

@@ -18,6 +18,7 @@ from kernels.structured.response import BINS, bent_wave, phase_table
 from kernels.structured.triangulate import ProjectorModel
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.wave_order import other_orders
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.kary import KaryCode
@@ -60,8 +61,8 @@ MEDIAN_SQUARE = 0.6
 OFFSETS = ((0.25, "-π/2"), (0.5, "π"), (-0.25, "π/2"))
 """Turns to add to the phases, and the change of offset_rad that this makes."""
 SPAN_STEP, LOOSE = 1 / 72, 0.05
-"""Turns between the offsets of one wave that are tried, and number of turns over which they fit from which on that is said: a fifth of
-another frame in each shifts the wave by that much."""
+"""Turns between the offsets of one wave that are tried, and turns over which they fit from which on that is said: a fifth of another
+frame in each shifts the wave by that much."""
 
 
 class Waves(NamedTuple):
@@ -185,19 +186,19 @@ def _check_several(waves: Waves) -> str | None:
     limit = float(np.hypot(limit, MEDIAN_SQUARE**0.5 * noise))
     found = [(misfit(-turns % 1.0, waves.periods), "fit each other if their steps run backwards: check step"),
              *((misfit(turns + change, waves.periods), f"fit each other if their offset is changed by {words}: check offset_rad and step")
-               for change, words in OFFSETS)]
+               for change, words in OFFSETS), *((misfit(turns, periods), order) for periods, order in other_orders(waves.periods))]
     best, words = min(found)
-    if best > limit:
-        few = some_of(waves, SOME_FOR_PERIODS)[0]
-
+    if best > max(MISFIT, NOISE_TIMES * noise):  # none of them makes all agree
         def other_misfit(index: int, period: float) -> float:
-            return misfit(few, np.where(np.arange(len(waves.periods)) == index, period, waves.periods), (0.0,))
+            periods = np.where(np.arange(len(waves.periods)) == index, period, waves.periods)
+            return misfit(some_of(waves, SOME_FOR_PERIODS)[0], periods, (0.0,))
 
-        best, index, other = min((other_misfit(index, period), index, period) for index in range(len(waves.periods))
-                                 for period in _periods_about(waves.periods, index, waves.extent))
-        best, other = min((other_misfit(index, period), period)
-                          for period in other + np.linspace(-1, 1, 41) * PERIOD_STEP * other**2 / waves.extent)
-        words = f"of {waves.periods[index]:g} px fit the others as waves of {other:.3g} px: check period_px"
+        _, index, other = min((other_misfit(index, period), index, period) for index in range(len(waves.periods))
+                              for period in _periods_about(waves.periods, index, waves.extent))
+        of_period, other = min((other_misfit(index, period), period)
+                               for period in other + np.linspace(-1, 1, 41) * PERIOD_STEP * other**2 / waves.extent)
+        text = f"of {waves.periods[index]:g} px fit the others as waves of {other:.3g} px: check period_px"
+        best, words = min((best, words), (of_period, text))
     if best > limit:
         return None
     return f"contradict each other by {360 * declared:.2g}° as declared ({360 * best:.2g}° else), and {words}"

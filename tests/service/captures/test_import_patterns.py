@@ -143,6 +143,13 @@ def test_a_phase_with_a_gray_code(relit, tmp_path):
     assert maps.mask[LIT].mean() > 0.97 and error(maps).max() < 0.2 * COLUMN_M
 
 
+def test_stripes_wider_than_the_period_are_refused(relit, tmp_path):
+    write_stack(tmp_path, [wave(U, 16, -step / 4) for step in range(4)], "phase_{}.png")
+    write_stack(tmp_path, [gray(U, bit, 16) for bit in range(2, -1, -1)], "gray_{}.png")
+    words = ("--periods", "16", "--steps", "4", "--images", "phase_*", "--gray-images", "gray_*", "--gray-stripe", "32")
+    relit("import", "phase", tmp_path, "--projector", SIZE, *words).refused("--gray-stripe 32: stripes wider than the period of 16 px")
+
+
 @pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3", "slstudio-micro", "slstudio-modulated"])
 def test_slstudio(relit, tmp_path, codec):
     """frameSeq_0.bmp … as its scan worker writes them, with its calibration.xml; waves begin at the centre of the first column."""
