@@ -21,6 +21,10 @@ class AssetError(ValueError):
     """The maps or the path cannot become an asset; its text is one plain sentence."""
 
 
+class SurfaceError(AssetError):
+    """What results hold makes no surface; whoever has read them names their file before its text."""
+
+
 class DivergedError(Exception):
     """This worker's results differ from those of the worker that has the job, so that it cannot help."""
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -17,7 +18,7 @@ from service.asset.content.surface import unit_in_metres
 from service.asset.usd.layers import Description
 from service.asset.usd.sequence_asset import Faces, Moment, SequenceSizes, write_sequence_asset
 from service.asset.usd.surroundings import Surroundings
-from service.errors import AssetError, RequestError
+from service.errors import AssetError, RequestError, SurfaceError
 from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
@@ -102,10 +103,12 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
     contents = {path.stem: digest(path), **_content_hashes(around)}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
-    maps, _, repairs = repair_heights(maps)
+    with _named(path):
+        maps, _, repairs = repair_heights(maps)
     more = {"levels": request.levels, "surroundings": around} if writer.variants else {}
-    report = writer.surface(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version,
-                            textures=request.textures, **more)
+    with _named(path):
+        report = writer.surface(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version,
+                                textures=request.textures, **more)
     warnings = [*repairs, *clipping_sentences({**(around.clipped or {}), **(around.rig.clipped if around.rig is not None else {})}),
                 *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"), *report.warnings]
     if (plain := _plain(maps)) is not None:
@@ -115,6 +118,15 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
     warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
                  for layer, count in report.clipped_pixels.items() if count]
     return Exported(request.out, tuple(warnings), report.sizes, report.lights)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the file of results in an error about what it holds."""
+    try:
+        yield
+    except SurfaceError as error:
+        raise SurfaceError(f"{path}: {error}") from error
 
 
 def _plain(maps: SurfaceMaps) -> str | None:
@@ -135,8 +147,9 @@ def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple
     contents = {file.stem: digest(file) for file in (path, beside) if file.exists()}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
-    warnings = write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
-                     geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
+    with _named(path):
+        warnings = write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
+                         geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
     return Exported(request.out, warnings, {})
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from kernels.relight.weights.environment_sources import EnvironmentParts, EnvironmentSamples, sample_environment, split_environment
 from service.errors import RequestError
 from service.requests.light.frame_range import numbered
-from stage.colour.environment_maps import check_environment, outside_sentences, read_environment
+from stage.colour.environment_maps import check_environment, full_sentences, multiplied_sentences, outside_sentences, read_environment
+from stage.formats.images import read_header
 from stage.stack import fingerprint
 
 SHARP_RADIUS_DEGREES = 2.0
@@ -57,6 +58,8 @@ class Environments:
         """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
         self.outside: dict[str, float] = {}
         """The part of the light that colours outside of the working space gain, by the names of the maps that were read so far."""
+        self._full: dict[str, float] = {}
+        self._multiplied: dict[str, float] = {}
         self._rows: dict[str, int] = {}
         self._digests: dict[Path, str] = {}
         self._last: tuple[Path, str, EnvironmentMap] | None = None
@@ -77,7 +80,9 @@ class Environments:
     def read(self, path: Path, space: str) -> EnvironmentMap:
         """Return one environment map in a working space; the last one that was read is kept."""
         if self._last is None or self._last[:2] != (path, space):
-            self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped, outside=self.outside)))
+            radiance = read_environment(path, space, clipped=self.clipped, outside=self.outside, full=self._full)
+            self._last = (path, space, EnvironmentMap(radiance))
+            self._multiplied[path.name] = read_header(path).multiplied
             self._rows[path.name] = len(self._last[2].radiance)
         return self._last[2]
 
@@ -85,6 +90,7 @@ class Environments:
         """Return a sentence for each thing that makes the light of the maps that were read so far another one than theirs."""
         found = outside_sentences(self.outside, "environment", "the working space",
                                   "give images, or lamps, in a wider space, or a map without such colours")
+        found += [*full_sentences(self._full), *multiplied_sentences(self._multiplied)]
         fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
         if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
             half = np.pi / (2 * rows)

@@ -1,5 +1,6 @@
 """Sentences about frames: light that the captured images do not hold, from beyond the captured lights or clipped; and the matte."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from service.relight.clipping import Clipping
 from stage.colour.radiance import clipping_sentences
+from stage.formats import exr
 from stage.results.matte import Matte, MatteSource
 
 LEAST_BEYOND = 0.05
@@ -87,6 +89,14 @@ def clipped_sentence(shares: Sequence[float], pixels: float, picture: str, known
     red, green, blue = (_percent(share) for share in shares)
     return (f"{red} of the red, {green} of the green and {blue} of the blue of {picture} is from readings that are clipped in every frame "
             f"of their light, at {_percent(pixels)} of the object's pixels: it is {known}")
+
+
+def dim_sentences(peak: float) -> list[str]:
+    """Return a sentence if the largest value of all frames, `peak`, is so small that half floats store them in coarse steps, else none."""
+    if not 0 < peak < exr.HALF_NORMAL:
+        return []
+    return [f"the brightest value of the frames is {peak:.2g}: below {exr.HALF_NORMAL:.2g} half floats have steps of {exr.HALF_STEP:.2g}, "
+            f"in which darker parts are lost; raise --exposure by {round(-math.log2(peak))} to bring it to about 1"]
 
 
 @dataclass

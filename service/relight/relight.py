@@ -17,7 +17,7 @@ from service.light_estimation.dark_lights import dark_frames, dark_sentence
 from service.relight.attributes import time_attributes
 from service.relight.clipping import Clipping
 from service.relight.combine import chunk_frames, linear_frames, row_blocks
-from service.relight.findings import FrameFindings, MatteFindings
+from service.relight.findings import FrameFindings, MatteFindings, dim_sentences
 from service.relight.guide import Guide
 from service.relight.layers import frame_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, FrameLight, ModelUse
@@ -115,7 +115,8 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         numbered = [(frame.scheduled.number, frame.path) for frame in plan.frames]
         write_nuke_script(request.nuke, request.out, numbered, plan.groups, plan.rate)
     timings.close()
-    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, mattes.sentence, findings.sentences)
+    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, mattes.sentence,
+                           (*findings.sentences, *dim_sentences(writer.written.peak)))
     if request.report is not None:
         write_text(request.report, report(
             request,

@@ -16,7 +16,7 @@ from service.relight.clipping import Clipping
 from service.relight.combine import linear_frames
 from service.relight.environments import Environments
 from service.relight.far_light import far_light, far_samples
-from service.relight.findings import FrameFindings
+from service.relight.findings import FrameFindings, dim_sentences
 from service.relight.guide import Guide
 from service.relight.layers import check_layers, frame_matte, hard_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, ModelUse
@@ -93,7 +93,8 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     timings.close()
     negative = {**({} if environments is None else environments.clipped or {}), **({} if capture is None else capture.clipped)}
     doubts = [] if environments is None else environments.doubts()
-    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, (*warnings, *doubts, *clipping_sentences(negative)))
+    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, (*warnings, *doubts, *clipping_sentences(negative),
+                                                                                       *dim_sentences(writer.written.peak)))
 
 
 def check(request: ShadeRequest) -> Path:

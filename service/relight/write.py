@@ -96,6 +96,8 @@ class Written(NamedTuple):
     frames: int
     clipped: int
     """Pixels beyond the largest half value, stored as that value."""
+    peak: float
+    """The largest value of all frames; -inf: there is none."""
     half_s: float
     """Seconds that threads spent on converting float to half."""
     file_s: float
@@ -112,7 +114,7 @@ class FrameWriter:
         self._pending: list[Future[None]] = []
         self._lock = threading.Lock()
         self._told = 0
-        self.written = Written(0, 0, 0.0, 0.0)
+        self.written = Written(0, 0, -np.inf, 0.0, 0.0)
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -186,31 +188,31 @@ class FrameWriter:
 
     def _write(self, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> None:
         began = time.perf_counter()
-        parts, clipped = _parts(file, frame, colours, form)
+        parts, clipped, peak = _parts(file, frame, colours, form)
         halved = time.perf_counter()
         exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata}, checksum=True)
-        self._count(1, clipped, began, halved)
+        self._count(1, clipped, peak, began, halved)
 
     def _append(self, to: exr_rows.RowFile, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray],
                 form: FrameFormat) -> None:
         began = time.perf_counter()
-        parts, clipped = _parts(file, frame, colours, form)
+        parts, clipped, peak = _parts(file, frame, colours, form)
         halved = time.perf_counter()
         to.append(parts)
-        self._count(0, clipped, began, halved)
+        self._count(0, clipped, peak, began, halved)
 
     def _end(self, growing: AbstractContextManager[exr_rows.RowFile]) -> None:
         began = time.perf_counter()
         growing.__exit__(None, None, None)
-        self._count(1, 0, began, began)
+        self._count(1, 0, -np.inf, began, began)
 
-    def _count(self, frames: int, clipped: int, began: float, halved: float) -> None:
-        """Add frames that are files, clipped pixels, and the seconds until and since `halved`."""
+    def _count(self, frames: int, clipped: int, peak: float, began: float, halved: float) -> None:
+        """Add frames that are files, clipped pixels, their largest value, and the seconds until and since `halved`."""
         ended = time.perf_counter()
         with self._lock:
             before = self.written
-            self.written = Written(before.frames + frames, before.clipped + clipped, before.half_s + halved - began,
-                                   before.file_s + ended - halved)
+            self.written = Written(before.frames + frames, before.clipped + clipped, max(before.peak, peak),
+                                   before.half_s + halved - began, before.file_s + ended - halved)
             if frames:
                 self._tell(self.written.frames)
 
@@ -220,11 +222,11 @@ class FrameWriter:
         self._done(self._told)
 
 
-def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int]:
-    """Return what the file of a frame holds, of the whole frame or of rows, and the number of clipped pixels."""
+def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int, float]:
+    """Return what the file of a frame holds, of the whole frame or of rows, the number of clipped pixels, and the largest value."""
     if frame.dtype != np.float16:
         frame = _finished(frame, file, form)
-    bounded = _bounded(frame)
+    bounded, peak = _bounded(frame)
     clipped = 0 if bounded is frame else int((bounded != frame).any(axis=0).sum())
     picture = _half(bounded, form, "")
     if form.alpha is not None:
@@ -235,11 +237,11 @@ def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray]
         layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
     for name, layer in layers.items():
         if name != Layer.SPECULAR or name in form.parts:
-            parts.append(exr.Part(name, _half(_bounded(layer), form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
+            parts.append(exr.Part(name, _half(_bounded(layer)[0], form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
     parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
     if not form.in_parts:
         parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
-    return parts, clipped
+    return parts, clipped, peak
 
 
 def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarray:
@@ -257,7 +259,9 @@ def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.nda
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}
 
 
-def _bounded(frame: np.ndarray) -> np.ndarray:
-    """Return a frame within the range of half: the same array where no value is beyond it, which takes less than to clip it."""
-    beyond = bool(frame.max() > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)
-    return np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX) if beyond else frame
+def _bounded(frame: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return a frame within the range of half, the same array where no value is beyond it, which takes less than to clip it, and its
+    largest value."""
+    peak = float(frame.max())
+    beyond = bool(peak > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)
+    return np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX) if beyond else frame, peak

@@ -16,7 +16,7 @@ from stage.colour.colour_spaces import is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
-from stage.formats.exif import Exposure, check_agreement, exposure_times, unused_exposures
+from stage.formats.exif import Exposure, check_agreement, exposure_times, multiplied_otherwise, unused_exposures
 from stage.formats.exr import PRIMARIES
 from stage.formats.images import ImageHeader
 from stage.pixels import AS_RECORDED, Crop, PixelChoices
@@ -219,7 +219,8 @@ class Capture:
             frames = tuple(frame.model_copy(update={"exposure_s": times[frame.image]}) for frame in self.manifest.frames)
             return replace(self, manifest=self.manifest.model_copy(update={"frames": frames, "exposure_from": None}))
         timed = any(frame.exposure_s is not None for frame in self.manifest.frames)
-        return self if timed else replace(self, doubts=tuple(unused_exposures(exposures)))
+        multipliers = {frame.image: headers[frame.image].multiplied for frame in self.manifest.frames if frame.image in headers}
+        return self if timed else replace(self, doubts=(*unused_exposures(exposures), *multiplied_otherwise(multipliers)))
 
     def _other_spaces(self, headers: Mapping[str, ImageHeader]) -> list[str]:
         """Return a sentence where images declare another scene-linear colour space than the manifest."""

@@ -1,5 +1,6 @@
 """Reading of environment maps: lat-long images of the radiance from every direction, +y at the top and +z in the middle."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,34 @@ from stage.colour.colour import convert
 from stage.colour.radiance import CLIP_NEGATIVE, check_finite, check_radiance, clip_negative
 from stage.errors import ImageError
 from stage.formats import exr, images
+from stage.formats.exif import SAME
 
 SUFFIXES = {".exr", ".hdr"}
+LEAST_FULL = 0.01
+"""Part of light, from texels at the largest half value, from which on it is said."""
 LEAST_OUTSIDE = 0.01
 """Part of light, added by colours outside of a space, from which on it is said."""
+
+
+def full_sentences(full: Mapping[str, float]) -> list[str]:
+    """Return a sentence about the map with the largest part of its light from texels at the largest half value, or none where it is small.
+    `full`: that part by the names of the files, as read_environment tells."""
+    most = max(full, key=lambda name: full[name], default=None)
+    if most is None or full[most] < LEAST_FULL:
+        return []
+    return [f"environment {most}: {100 * full[most]:.0f} % of its light is from texels at {exr.HALF_MAX:g}, the largest half float, which "
+            "stands for all that is brighter: its sun or lamps may be too dark; save the map as 32-bit float or .hdr"]
+
+
+def multiplied_sentences(multiplied: Mapping[str, float]) -> list[str]:
+    """Return a sentence about Radiance maps whose headers say that their values were multiplied, or none.
+    `multiplied`: the factors by the names of the files."""
+    if not multiplied or all(abs(factor - 1) <= SAME for factor in multiplied.values()):
+        return []
+    low, high = min(multiplied, key=lambda name: multiplied[name]), max(multiplied, key=lambda name: multiplied[name])
+    factors = f"{multiplied[low]:.4g}" + ("" if low == high else f" ({low}) to {multiplied[high]:.4g}")
+    return [f"environment {high}: its header says that the values were multiplied by {factors} (EXPOSURE), and they are taken as they are: "
+            "divide them by that factor for the light of the scene"]
 
 
 def outside_sentences(outside: dict[str, float], what: str, space: str, remedy: str) -> list[str]:
@@ -34,11 +59,12 @@ def check_environment(path: Path) -> None:
 
 
 def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None,
-                     outside: dict[str, float] | None = None) -> np.ndarray:
+                     outside: dict[str, float] | None = None, full: dict[str, float] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
     `path`: lat-long .exr or .hdr. `space`: the scene-linear colour space of the result. `clipped`: is given the number of pixels with
     values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. `outside`: is given the
-    part of its light that colours outside of the gamut of `space` gain, 0 or above. Returns [rows, cols, 3] float32, scene-linear, none of
+    part of its light that colours outside of the gamut of `space` gain, 0 or above. `full`: is given the part of its light that texels at
+    the largest half value hold, if it is EXR. Returns [rows, cols, 3] float32, scene-linear, none of
     them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is 0."""
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:
@@ -53,8 +79,11 @@ def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None =
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
     shown = np.maximum(converted, 0)
+    height = np.sin(np.pi * (np.arange(len(shown)) + 0.5) / len(shown))
+    if full is not None and path.suffix.lower() == ".exr" and (at_end := (pixels == exr.HALF_MAX).any(axis=-1)).any():
+        whole = float(np.einsum("rck,r->", shown, height))
+        full[path.name] = float(np.einsum("rck,rc,r->", shown, at_end, height)) / whole if whole > 0 else 0.0
     if outside is not None and given != space:
-        height = np.sin(np.pi * (np.arange(len(shown)) + 0.5) / len(shown))
         whole = float(np.einsum("rck,r->", shown, height))
         outside[path.name] = float(np.einsum("rck,r->", shown - converted, height)) / whole if whole > 0 else 0.0
     return shown

@@ -1,12 +1,15 @@
-"""Records of cameras in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright.
+"""Records of cameras in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright; and the
+factor that a Radiance file says its values were multiplied by.
 
 Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tags ExposureTime, FNumber and
 PhotographicSensitivity, and Orientation, which TIFF 6.0 defines; in Radiance files the order of the rows and columns says the same.
+Ward, "Radiance File Formats": every EXPOSURE of a header is a factor that the values have been multiplied by.
 """
 
 import math
+import re
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -14,6 +17,8 @@ from stage.errors import ManifestError
 
 SAME = 0.01
 """Part by which two recorded values of one setting may differ: they are fractions of small integers."""
+RADIANCE_HEADER_BYTES = 1 << 16
+"""Bytes of a Radiance file in which its header is looked for: programs add a line each."""
 UPRIGHT = 1
 """The orientation of images whose first row is the top and whose first column is the left."""
 
@@ -55,6 +60,29 @@ def unused_exposures(exposures: Mapping[str, Exposure]) -> list[str]:
         return []
     return [f"frames[].exposure_s: is missing, and EXIF says that frames were exposed for {min(times):.4g} to {max(times):.4g} s: with "
             "\"exposure_from\": \"exif\" the readings are divided by these times"]
+
+
+def radiance_multiplier(file: BinaryIO) -> float:
+    """Return the factor that a Radiance file says its values were multiplied by; 1 where it says none. Leaves the file at its beginning."""
+    file.seek(0)
+    header, end, _ = file.read(RADIANCE_HEADER_BYTES).partition(b"\n\n")
+    file.seek(0)
+    factors = re.findall(rb"^EXPOSURE=\s*([0-9.eE+-]+)\s*$", header, re.MULTILINE) if end else []
+    try:
+        return sound(math.prod(map(float, factors))) or 1.0
+    except ValueError:  # no number
+        return 1.0
+
+
+def multiplied_otherwise(multipliers: Mapping[str, float]) -> list[str]:
+    """Return a sentence where Radiance images without given exposures were multiplied by different factors; none otherwise."""
+    if not multipliers:
+        return []
+    low, high = min(multipliers, key=lambda name: multipliers[name]), max(multipliers, key=lambda name: multipliers[name])
+    if multipliers[high] <= (1 + SAME) * multipliers[low]:
+        return []
+    return [f"frames[].exposure_s: is missing, and EXPOSURE in the headers says that values were multiplied by {multipliers[low]:.4g} "
+            f"({low}) to {multipliers[high]:.4g} ({high}): give each factor as exposure_s, by which readings are divided"]
 
 
 class _Turn(NamedTuple):

@@ -18,6 +18,8 @@ from stage.formats.exr_scan import missing_bytes, scan_header
 
 HALF_MAX = 65504.0
 """The largest half value."""
+HALF_NORMAL, HALF_STEP = 2.0**-14, 2.0**-24
+"""The least half value that has all its digits, and the step between the values below it."""
 
 
 class Compression:

@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 from stage import inputs
 from stage.errors import ImageError
 from stage.formats import avif, camera_raw, exr, integrity
-from stage.formats.exif import TURNS, UPRIGHT, Exposure, sound, upright, upright_size
+from stage.formats.exif import TURNS, UPRIGHT, Exposure, radiance_multiplier, sound, upright, upright_size
 from stage.pixels import Crop
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp", ".ppm", ".pgm"}
@@ -35,6 +35,7 @@ class ImageHeader(NamedTuple):
     orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.formats.exif.TURNS`; they are read upright
     exposure: Exposure = Exposure()  # as EXIF says
     half: bool = False  # whether all colour channels hold half values
+    multiplied: float = 1.0  # the factor that a Radiance file says its values were multiplied by
     space: str = ""  # the scene-linear colour space that an EXR file declares; empty where it declares none that is known
 
 
@@ -97,7 +98,8 @@ def header_of(source: inputs.Source) -> ImageHeader:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
         return ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                           spec.format.basetype not in FLOATING, orientation, _exposure(spec))
+                           spec.format.basetype not in FLOATING, orientation, _exposure(spec),
+                           multiplied=radiance_multiplier(source.file) if suffix == ".hdr" else 1.0)
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
@@ -282,6 +284,8 @@ def _check_suffix(path: str | Path) -> None:
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:
     if {"R", "G", "B"} <= set(names):
         return ("R", "G", "B")
+    if {"X", "Y", "Z"} <= set(names) or "RY" in names or "BY" in names:
+        raise ImageError(f"{path}: has channels {', '.join(names)}, of which Y alone is grey: convert its colours to R, G, B")
     if "Y" in names:
         return ("Y",)
     flat = [name for name in names if name != "A"]

@@ -68,6 +68,18 @@ def rgb(path: Path, layer: str = "") -> np.ndarray:
     return np.stack([channels[layer + name].pixels.astype(np.float64) for name in "RGB"], axis=-1)
 
 
+def write_radiance(path: Path, pixels: np.ndarray, *lines: str) -> Path:
+    """Write [rows, cols, 3] as a Radiance file of uncompressed RGBE with further lines in its header."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    largest = pixels.max(axis=-1)
+    exponent = np.where(largest > 0, np.frexp(largest)[1], -128)
+    codes = np.concatenate([np.ldexp(pixels, 8 - exponent[..., None]), exponent[..., None] + 128], axis=-1)
+    rows, cols = largest.shape
+    head = "\n".join(["#?RADIANCE", *lines, "FORMAT=32-bit_rle_rgbe", "", f"-Y {rows} +X {cols}", ""])
+    path.write_bytes(head.encode() + np.clip(codes, 0, 255).astype(np.uint8).tobytes())
+    return path
+
+
 def write_image(path: Path, pixels: np.ndarray, **attributes: Any) -> Path:
     """Write [rows, cols] or [rows, cols, channels] with OpenImageIO and its attributes; the array's type is the file's."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from service.asset.content.links import Links
 from service.asset.content.mesh import SurfaceMesh, height_mesh, valid_heights
 from service.asset.content.metallic import MetallicLook, metallic_look
 from service.asset.content.textures import BLEED_TEXELS, bleed
-from service.errors import AssetError
+from service.errors import SurfaceError
 from stage.capture.camera import Camera
 from stage.colour.colour import convert
 from stage.formats.ply import POINTS_FILE, PointCloud
@@ -63,7 +63,7 @@ def measured_points(maps: DepthMaps, cloud: PointCloud | None) -> MeasuredPoints
     else:
         found = _of_cloud(maps, cloud)
     if len(found.points) == 0:
-        raise AssetError("the depth has no point, so there is nothing to export")
+        raise SurfaceError("the depth has no point, so there is nothing to export")
     return found
 
 
@@ -110,8 +110,8 @@ def _of_cloud(maps: DepthMaps, cloud: PointCloud) -> MeasuredPoints:
     depth = maps.depth[rows, cols]
     agree = np.count_nonzero(inside & maps.mask[rows, cols] & (np.abs(depth + points[:, 2]) <= SAME_DEPTH * np.abs(depth)))
     if agree < LEAST_AGREEMENT * len(cloud.points) or (len(cloud.points) == 0 and maps.mask.any()):
-        raise AssetError(f"{POINTS_FILE} and {DEPTH_FILE} are not of one measurement: {agree} of {len(cloud.points)} points lie on a pixel "
-                         f"of the depth: run `relit depth` again, or move {POINTS_FILE} away to export without colours")
+        raise SurfaceError(f"{POINTS_FILE} and {DEPTH_FILE} are not of one measurement: {agree} of {len(cloud.points)} points lie on a "
+                           f"pixel of the depth: run `relit depth` again, or move {POINTS_FILE} away to export without colours")
     return MeasuredPoints(points, rows, cols, linear_colours(cloud.colours[seen]), None if cloud.normals is None else cloud.normals[seen])
 
 

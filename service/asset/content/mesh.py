@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.asset.content.links import Links, drawn_apart, height_of, relief, split_fans, surface_links, touched, without_islands
-from service.errors import AssetError
+from service.errors import SurfaceError
 from stage.capture.camera import Camera
 from stage.results.depth_breaks import STEEPEST
 from stage.results.maps import SurfaceMaps
@@ -80,13 +80,14 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links:
     valid = valid_heights(maps)
     assert maps.height is not None
     if not _three_neighbours(valid):
-        raise AssetError(f"the mask holds {np.count_nonzero(valid)} pixels with a height and no three of them are neighbours, so there is "
-                         "no face to export")
+        raise SurfaceError(f"the mask holds {np.count_nonzero(valid)} pixels with a height and no three of them are neighbours, so there "
+                           "is no face to export")
     links = without_islands(surface_links(maps, valid) if links is None else links)
     step = _step(touched(links), vertex_budget)
     faces = cell_faces(links, step)
     if len(faces.quads) + len(faces.triangles) == 0:
-        raise AssetError("no neighbouring pixels lie on one surface, so there is no face to export: --geometry points exports them alone")
+        raise SurfaceError("no neighbouring pixels lie on one surface, so there is no face to export; --geometry points "
+                           "exports those of a depth")
     camera, (rows, cols) = maps.camera, faces.pixel.T
     nearest, other = (relief(maps.height[tuple(pixel.T)].astype(np.float64), camera) for pixel in (faces.pixel, faces.other))
     slope = np.where(faces.weight > 0, np.clip(nearest - other, -STEEPEST, STEEPEST), nearest - other)
@@ -109,7 +110,7 @@ def camera_points(camera: Camera, u: np.ndarray, v: np.ndarray, height: np.ndarr
 def valid_heights(maps: SurfaceMaps) -> np.ndarray:
     """Return where the maps have a height in front of the camera: [rows, cols] bool."""
     if maps.height is None:
-        raise AssetError("the maps have no height layer, so there is no surface to export: solve with a height")
+        raise SurfaceError("the maps have no height layer, so there is no surface to export: solve with a height")
     valid = maps.mask & np.isfinite(maps.height)
     if maps.camera.projection == "perspective":
         valid &= maps.height < 0

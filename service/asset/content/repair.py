@@ -11,7 +11,7 @@ import numpy as np
 
 from service.asset.content.links import ISLAND_PIXELS, height_of, relief, slopes, surface_links, touched, without_islands
 from service.asset.content.mesh import valid_heights
-from service.errors import AssetError
+from service.errors import SurfaceError
 from stage.results.maps import SurfaceMaps
 
 MOST_SPIKES = 0.05
@@ -61,8 +61,8 @@ def repair_heights(maps: SurfaceMaps) -> Repaired:
         spikes += len(filled[0])
         rows, cols = rows[~ring], cols[~ring]
         if spikes > most:
-            raise AssetError(f"the height stands off that of all neighbours, unlike the normals say, in more than {MOST_SPIKES:.0%} of the "
-                             "pixels, so that there is no surface to export: solve again, with --method svbrdf or with more lights")
+            raise SurfaceError(f"the height stands off that of all neighbours, unlike the normals say, in more than {MOST_SPIKES:.0%} of "
+                               "the pixels, so that there is no surface to export: solve again, with --method svbrdf or with more lights")
     told = TOLD * np.count_nonzero(valid)
     warnings = []
     if spikes > told:

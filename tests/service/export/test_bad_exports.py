@@ -28,8 +28,8 @@ def lonely(mask):
 
 BALL = make_ball()
 MAPS = {
-    "no height": ({"height": None}, "no height layer, so there is no surface to export"),
-    "no pixel": ({"mask": np.zeros_like(BALL.mask)}, "there is no face to export"),
+    "no height": ({"height": None}, "maps.exr: the maps have no height layer, so there is no surface to export"),
+    "no pixel": ({"mask": np.zeros_like(BALL.mask)}, "maps.exr: the mask holds 0 pixels with a height"),
     "no neighbours": ({"mask": lonely(BALL.mask)}, "there is no face to export"),
     "no number": ({"height": np.full_like(BALL.height, np.nan)}, "layer height has 256 values that are not finite"),
     "foreign": (lambda path: write_exr(path, np.ones((4, 8, 3))), "maps.exr: carries no relit:camera attribute, so it is not a"),

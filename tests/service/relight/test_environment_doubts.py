@@ -1,10 +1,11 @@
-"""Environment maps whose light is another one where they are used: colours outside of the gamut, and too few rows."""
+"""Environment maps whose light is another one where they are used: colours outside of the gamut, too few rows, values that were clipped or
+multiplied."""
 
 import numpy as np
 import pytest
 
 from service.relight.environments import Environments
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import write_exr, write_radiance
 
 REC709 = "lin_rec709_scene"
 
@@ -29,3 +30,25 @@ def test_too_few_rows_are_said(tmp_path, rows, words):
     """Truth: (π/2n) / sin(π/2n), the sum of the rows' solid angles over 4π."""
     found = doubts(tmp_path, (1.0, 1.0, 1.0), rows)[1].doubts()
     assert [words in sentence for sentence in found] == [True] if words else found == []
+
+
+@pytest.mark.parametrize(("sun", "dtype", "said"), [(9e4, np.float16, True), (9e4, np.float32, False), (6e4, np.float16, False)])
+def test_a_sun_that_half_floats_cannot_hold_is_said(tmp_path, sun, dtype, said):
+    """Two texels at the horizon of 32 × 64, each 2 sin(π/64) 2π/64 sr, hold 65504 of their 90000; the rest has 4π sr of 1."""
+    radiance = np.ones((32, 64, 3))
+    radiance[15, 20:22] += sun
+    environments = Environments(write_exr(tmp_path / "sky.exr", np.minimum(radiance, 65504 if dtype == np.float16 else np.inf), dtype))
+    environments.read(tmp_path / "sky.exr", REC709)
+    texel = 2 * np.sin(np.pi / 64) * 2 * np.pi / 64
+    share = 2 * texel * 65504 / (2 * texel * 65504 + 4 * np.pi)
+    assert [f"{100 * share:.0f} % of its light is from texels at 65504" in each for each in environments.doubts()] == [True] * said
+
+
+@pytest.mark.parametrize(("factors", "words"), [
+    ((1, 1), None), ((4, 4), "multiplied by 4 (EXPOSURE)"), ((1, 4), "multiplied by 1 (sky.1.hdr) to 4 (EXPOSURE)")])
+def test_radiance_maps_that_were_multiplied_are_said(tmp_path, factors, words):
+    environments = Environments(tmp_path / "sky.#.hdr")
+    for number, factor in enumerate(factors, start=1):
+        write_radiance(tmp_path / f"sky.{number}.hdr", np.full((16, 32, 3), float(factor)), f"EXPOSURE={factor}")
+        assert (environments.read(environments.path(number), REC709).radiance == factor).all()
+    assert [words in each for each in environments.doubts()] == ([] if words is None else [True])

@@ -1,8 +1,11 @@
 """Frames as files."""
 
+import re
+
 import numpy as np
 import pytest
 
+from service.relight.findings import dim_sentences
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.requests.light.picture_options import FrameCompression
 from stage.formats import exr
@@ -32,3 +35,14 @@ def test_halves_from_a_gpu_are_written_as_floats_are(form, tmp_path):
 def test_frames_that_are_changed_first_do_not_come_as_halves(form, changed, tmp_path):
     assert not form._replace(**changed).as_computed([FrameFile(tmp_path / "f.exr", 1.0 if changed else 2.0, {})])
     assert form.as_computed([FrameFile(tmp_path / "f.exr", 1.0, {})])
+
+
+@pytest.mark.parametrize(("peaks", "said"), [((3e-6, 2e-7), "is 3e-06: below 6.1e-05 half floats have steps of 6e-08, .* by 18 to"),
+                                             ((1e-8, 0.0), "is 1e-08"), ((3e-6, 0.1), None), ((0.0, 0.0), None)])
+def test_frames_too_dim_for_half_floats_are_said(form, peaks, said, tmp_path):
+    """Unless another frame is bright, as where a range fades to black."""
+    frames = np.float32([[[peak] * 32] * 3 for peak in peaks])
+    with FrameWriter(lambda count: None) as writer:
+        writer.put([FrameFile(tmp_path / f"{index}.exr", 1.0, {}) for index in range(2)], frames, form, {})
+    found = dim_sentences(writer.written.peak)
+    assert len(found) == (said is not None) and all(re.search(str(said), each) for each in found)

@@ -14,7 +14,7 @@ from stage.formats.exif import TURNS, Exposure
 from stage.formats.images import read_header, read_recorded
 from stage.stack.brackets import merge_brackets
 from stage.stack.ingest import open_stack
-from tests.scenes.captures import edit_manifest, make_scene, manifest_of, write_image, write_manifest
+from tests.scenes.captures import edit_manifest, make_scene, manifest_of, write_capture, write_image, write_manifest, write_radiance
 
 SCENE = make_scene(size=12, lights=4)
 TIMES = (0.25, 1 / 60)
@@ -146,3 +146,29 @@ def test_a_resolution_of_the_recorded_pixels_is_explained(tmp_path):
     edit_manifest(tmp_path, camera={"projection": "orthographic", "resolution": [8, 6]})
     with pytest.raises(ImageError, match=r"is 6x8 once it is turned by 90° clockwise \(EXIF"):
         Capture.open(tmp_path)
+
+
+@pytest.mark.parametrize(("lines", "factor"), [
+    ((), 1), (("EXPOSURE=4",), 4), (("SOFTWARE=a", "EXPOSURE= 1.00", "pfilt -1", "EXPOSURE=5.000000e-01", "EXPOSURE=8"), 4),
+    (("EXPOSURE=no number",), 1), (("EXPOSURE=0",), 1)])
+def test_every_exposure_of_a_radiance_header_is_a_factor(tmp_path, lines, factor):
+    path = write_radiance(tmp_path / "a.hdr", np.full((4, 6, 3), 0.5), *lines)
+    assert read_header(path).multiplied == factor
+    np.testing.assert_array_equal(read_recorded(path), 0.5)  # as recorded
+
+
+@pytest.mark.parametrize(("factors", "exposed", "said"), [((1, 2, 0.25, 1), False, True), ((1, 2, 0.25, 1), True, False),
+                                                         ((4, 4, 4, 4), False, False)])
+def test_radiance_images_that_were_multiplied_otherwise_are_said(tmp_path, factors, exposed, said):
+    write_capture(tmp_path, SCENE)
+    frames = manifest_of(SCENE)["frames"]
+    for index, (image, factor, frame) in enumerate(zip(SCENE.images, factors, frames, strict=True)):
+        frame["image"] = write_radiance(tmp_path / f"{index}.hdr", factor * image, f"EXPOSURE={factor}").name
+        frame |= {"exposure_s": factor} if exposed else {}
+    edit_manifest(tmp_path, frames=frames)
+    words = "frames[].exposure_s: is missing, and EXPOSURE in the headers says that values were multiplied by 0.25 (2.hdr) to 2 (1.hdr)"
+    capture = Capture.open(tmp_path)
+    assert [doubt.startswith(words) for doubt in capture.doubts] == [True] * said
+    if exposed:  # readings are divided by the factors: to a code of RGBE
+        found, _ = merge_brackets(open_stack(capture), capture.sources(), distant_lights(capture)).pick_radiance(np.arange(144))
+        np.testing.assert_allclose(found, SCENE.images.reshape(4, 144, 3), atol=SCENE.images.max() / 128)

@@ -4,6 +4,7 @@ import struct
 
 import cv2
 import numpy as np
+import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
@@ -116,8 +117,6 @@ def test_alpha_is_dropped_and_not_multiplied(tmp_path):
 
 
 def test_channels_that_are_no_colour_are_named(tmp_path):
-    import OpenEXR
-
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"u": np.zeros((2, 2), np.float32), "v": np.zeros((2, 2), np.float32)}).write(
         str(tmp_path / "a.exr"))
     with pytest.raises(ImageError, match="has channels u, v: an image needs R, G, B or one grey"):
@@ -125,6 +124,17 @@ def test_channels_that_are_no_colour_are_named(tmp_path):
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"id": np.zeros((2, 2), np.uint32)}).write(str(tmp_path / "b.exr"))
     with pytest.raises(ImageError, match="integer identifiers"):
         read_pixels(tmp_path / "b.exr")
+
+
+@pytest.mark.parametrize("names", ["XYZ", ("BY", "RY", "Y")], ids=["tristimulus", "chroma"])
+def test_colours_that_are_not_red_green_and_blue_are_not_taken_for_grey(tmp_path, names):
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage},
+                 {name: np.full((5, 7), 0.5, np.float32) for name in names}).write(str(tmp_path / "a.exr"))
+    for read in (read_header, read_pixels):
+        with pytest.raises(ImageError, match=f"a.exr: has channels {', '.join(names)}, of which Y alone is grey: convert"):
+            read(tmp_path / "a.exr")
+    write_exr(tmp_path / "grey.exr", UNIT[..., 0])
+    assert read_header(tmp_path / "grey.exr").channels == 1
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "hdr", "bmp"])
