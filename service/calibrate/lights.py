@@ -33,7 +33,13 @@ from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_poi
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, dark_side, fit_brightness, fit_direction
-from service.light_estimation.semi_calibrated import Intensities, check_directions, fit_intensities, part_uncertainty
+from service.light_estimation.semi_calibrated import (
+    Intensities,
+    check_directions,
+    fit_intensities,
+    light_from_elsewhere,
+    uncertainty_of,
+)
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
 from stage.capture.light import DistantLight, PointLight
@@ -52,7 +58,8 @@ UNSURE = 0.05
 WIDE = 2.0
 """The size of the spot of a lamp over the median of all, from which something beside the lamp may be a part of it."""
 ROOM_LIGHT = 0.03
-"""Light on the dark side of a grey ball, over that where it faces a lamp, from which on it is said; dark rooms give one or two percent."""
+"""Light on the dark side of a ball or an object, over that where it faces a lamp, from which on it is said; dark rooms give one or two
+percent."""
 BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
@@ -302,7 +309,8 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
     timings.stage("fit", 1)
     try:
         found = fit_intensities(readings, usable, directions)
-        uncertainty = part_uncertainty(readings, usable, directions, found.irradiance)
+        elsewhere = light_from_elsewhere(readings, usable, directions, found.irradiance)
+        uncertainty = uncertainty_of(readings, usable, directions, found.irradiance, elsewhere)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
     alien = _contradicting(found)
@@ -325,6 +333,10 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
     warnings: tuple[str, ...] = () if unsure < UNSURE else (
         f"lights: parts of the object ask for lights that differ by {100 * unsure:.0f} %, as where it is glossy, rough, velvet or metal, "
         "or in shadow: measure them on a grey ball (relit calibrate grey-ball)",)
+    if elsewhere.max() > ROOM_LIGHT:
+        warnings = (*warnings, f"frames: surfaces have {100 * elsewhere.max():.0f} % of the light of a mean lamp from elsewhere, from the "
+                               "room, other surfaces or a dark level of the camera, which makes dim lamps too bright: add a frame of type "
+                               "off, or a dark image")
     if wrong:
         warnings = (*warnings, f"frames: {wrong}: readings contradict those under the other lights, as where an image is that of another "
                                "light, or clipped, or light.direction is wrong: their strength is not known")

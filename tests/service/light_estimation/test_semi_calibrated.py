@@ -5,7 +5,7 @@ import pytest
 
 from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest
 from service.light_estimation.lambertian import fit_lambertian, median_of, suspects
-from service.light_estimation.semi_calibrated import check_directions, fit_intensities, part_uncertainty
+from service.light_estimation.semi_calibrated import check_directions, fit_intensities, light_from_elsewhere, uncertainty_of
 from stage.errors import CalibrationError
 from tests.marks import first_short
 from tests.scenes.captures import angles_degrees, ring
@@ -44,6 +44,11 @@ def test_exact_readings_give_the_brightness(lights, least_z):
     np.testing.assert_allclose(found.irradiance.mean(axis=0), 1)
 
 
+def stated(*given):
+    """The stated uncertainty of the lights that were found."""
+    return uncertainty_of(*given, light_from_elsewhere(*given))
+
+
 def test_noise_is_averaged_and_stated():
     """1 % of the brightest reading, 1500 pixels: each light's mean is known to 0.1 %; the stated error is of that size."""
     directions, irradiance, readings, _ = scene(20, 0.3)
@@ -53,7 +58,7 @@ def test_noise_is_averaged_and_stated():
     error = relative_error(found, irradiance)
     assert error.max() < 0.005
     # the stated error is twice that of a sixth of the pixels, which is 2.4 times as large, and more where they face one way
-    assert 0.05 < np.sqrt((error**2).mean()) / part_uncertainty(*given, found.irradiance).mean() < 1
+    assert 0.05 < np.sqrt((error**2).mean()) / stated(*given, found.irradiance).mean() < 1
 
 
 @first_short("material", ["rough", "flat", "velvet"])
@@ -76,7 +81,7 @@ def test_the_stated_uncertainty_holds_what_other_reflection_than_lamberts_makes(
     readings = rng.uniform(0.2, 0.8, (1500, 3)) * irradiance[:, None] * shading[..., None]
     given = readings, np.ones(readings.shape[:2], bool), directions
     found = fit_intensities(*given)
-    ratio = relative_error(found, irradiance) / part_uncertainty(*given, found.irradiance)
+    ratio = relative_error(found, irradiance) / stated(*given, found.irradiance)
     assert np.median(ratio) < 2 and np.mean(ratio > 5) < 0.05, np.median(ratio)  # what all parts have in common is not seen
 
 
@@ -140,7 +145,20 @@ def test_a_dim_light_is_told_from_one_that_does_not_burn(part):
     true = (irradiance * factor)[burning]
     off = np.abs(found.irradiance[burning] / (true / true.mean(axis=0)) - 1)
     assert off.max() < 0.1 and np.delete(off, 2, axis=0).max() < 0.01
-    assert (off / part_uncertainty(*given, found.irradiance)[burning]).max() < 5
+    assert (off / stated(*given, found.irradiance)[burning]).max() < 5
+
+
+@pytest.mark.parametrize(("room", "bounced", "least"), [(0, 0, 0), (0.03, 0, 0.01), (0.1, 0, 0.03), (0, 1, 0.03)])
+def test_light_from_elsewhere_is_measured_and_held(room, bounced, least):
+    """From above, and from what lies around: lamps of a sixth of the others' strength were 10 % off at a twelfth of their uncertainty."""
+    directions, irradiance, readings, normals = scene(12, 0.5)
+    albedo = readings.max(axis=0) / (irradiance[:, None] * np.maximum(directions @ normals.T, 0)[..., None]).max(axis=0)
+    added = room * irradiance.mean() * albedo * (1 + normals[:, 1:2]) / 2
+    given = readings + added + bounced * albedo * readings.mean(axis=1, keepdims=True), np.ones(readings.shape[:2], bool), directions
+    found = fit_intensities(*given)
+    level = light_from_elsewhere(*given, found.irradiance)
+    assert level.max() < 1e-3 if not least else (least < level).all() and (level < 4 * least).all()  # half of the room is dark
+    assert (relative_error(found, irradiance) / stated(*given, found.irradiance)).max() < 2
 
 
 def test_consistent_lights_are_no_suspects():
