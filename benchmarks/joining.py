@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.file_mutations import write_between
 from service.joining.depth_and_normals import join_depth
-from tests.scenes.joined import MM, degrees_between, drifting, see
+from service.light_estimation.lambertian import degrees_between
+from tests.scenes.joined import MM, drifting, see
 
 CASES = ((0.5, 0.0, 0.5), (0.5, 2.0, 0.5), (0.2, 4.0, 2.0), (2.0, 3.0, 0.1))
 """Noise and smooth error of the normals in degrees, noise of the depth in millimetres."""

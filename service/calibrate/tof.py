@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from kernels import device as devices
 from kernels.device import to_numpy
@@ -191,12 +192,12 @@ def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Foun
                            "order of the captures, and their bin_s")
     middle, spread = float(measured[kept].mean()), float(ranges.std())
     entries = {"scale": scale, "offset_m": offset}
-    unknowns = 3 if plan.has_drift else 2
-    if len(kept) <= unknowns:
+    freedom = len(kept) - (3 if plan.has_drift else 2)
+    if freedom < 1:
         return _Found(entries, None, left_out, warnings)
     left = depths - scale * ranges + offset
     # that of any other distance, which a line through a bend misses by as much
-    sigma = float(np.sqrt(np.sum(left**2) / (len(kept) - unknowns)))
+    sigma = float(np.sqrt(np.sum(left**2) / freedom) * stdtrit(freedom, ndtr(2)) / 2)  # 2 σ hold what Student's t has within them
     entries |= {"middle_m": float(f"{middle:.4g}"), "scale_sigma": float(f"{sigma / spread / np.sqrt(len(kept)):.3g}")}
     if plan.has_drift:  # what the drift leaves open at temperatures as far apart as those of the sweep
         own = max(float(beside(warm[kept], measured[kept]).std()), 1e-300)

@@ -31,6 +31,7 @@ from service.requests.light.light_keys import LightKeys
 from service.requests.play import TwinRequest
 from service.twin.camera import TwinPicture
 from stage.colour.colour_spaces import Review
+from stage.errors import storage
 from stage.rig.chart import read_chart
 from stage.rig.rig import Rig, read_rig
 
@@ -107,8 +108,9 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     rate = request.frames_per_second or (None if keys is None else keys.frames_per_second) or FRAMES_PER_SECOND
     sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers, shown)
     timings.stage("files", 1)
-    for stale in request.out.glob("predicted.*.exr"):  # of an earlier run, whose cues go too
-        stale.unlink()
+    for stale in request.out.glob("predicted.[0-9][0-9][0-9][0-9]*.exr"):  # of an earlier run, whose cues go too
+        with storage("remove", stale):
+            stale.unlink()
     cues, report = write_cue_files(request, rig, quantised, numbers, rate, sections, warnings, timings)
     titles = [_title(*frame) for frame in zip(numbers, light.beyond, dilated.radius, strict=True)]
     picture = write_picture(request.out, rig, light.far, quantised.level, factor, titles, shown, request.review)

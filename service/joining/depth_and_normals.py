@@ -18,6 +18,7 @@ from kernels.surface.slopes import STEEPEST
 from service.joining.correction import correct
 from service.joining.depth_steps import SLOPE_ERROR, Edges, find_steps
 from service.joining.relief import Relief, compare_relief
+from service.light_estimation.lambertian import degrees_between
 from stage.spread import MAD_TO_SIGMA
 
 LEAST_DEPTHS = 12
@@ -107,7 +108,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     # turned lights look like a shift where surfaces are round, but the correction takes them up, and not a shift
     shift_px = compare_relief(u - correction, u_sigma, base, known & (part == largest) & ~rejected, part).shift_px
     variance += _shifted(base, shift_px)
-    turn = _degrees(normal, plane.turned(normal.astype(np.float64), slopes, correction, part, solved))[placed]
+    turn = degrees_between(normal, plane.turned(normal.astype(np.float64), slopes, correction, part, solved))[placed]
     contradicted = float(np.median(turn)) if turn.size else 0.0
     if contradicted <= np.degrees(max(SLOPE_ERROR, float(np.median(normal_sigma[solved])))):
         contradicted = 0.0
@@ -125,11 +126,6 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
                   shared_m, one_sided_m, contradicted)
-
-
-def _degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the angles [rows, cols] between unit vectors [3, rows, cols]."""
-    return np.degrees(np.arccos(np.clip((one * other).sum(axis=0), -1, 1)))
 
 
 def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:

@@ -11,6 +11,7 @@ from kernels import device as devices
 from kernels.status import Status
 from service.errors import RequestError
 from service.joining.depth_and_normals import Joined, join_depth
+from service.light_estimation.lambertian import degrees_between
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.solve import JoinRequest
@@ -119,7 +120,7 @@ def _maps(maps: SurfaceMaps, joined: Joined, contents: dict[str, str]) -> Surfac
 def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) -> dict[str, Any]:
     assert maps.normal is not None and depth.sigma is not None
     placed = joined.placed & maps.mask
-    turned = np.degrees(np.arccos(np.clip((maps.normal * np.moveaxis(joined.normal, 0, -1)).sum(axis=-1)[placed], -1, 1)))
+    turned = degrees_between(np.moveaxis(maps.normal, -1, 0), joined.normal)[placed]
     before = depth.sigma[placed & depth.mask]
     return {
         "pixels": {"mask": int(maps.mask.sum()), "with_depth": overlap, "placed": int(placed.sum()),

@@ -123,20 +123,30 @@ def near_lights(lights: Sequence[NearLight], first_row: int, surface: np.ndarray
             axis = None if light.axis is None else np.array(light.axis) / np.linalg.norm(light.axis)
             all_samples = few = sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)
         else:
-            area, distance = _extent(light, surface)
-            fewest = sources.SPHERE_SAMPLES if isinstance(light, SphereLight) else sources.RECTANGLE_SAMPLES
-            count = int(np.clip(4 * area / max(float(distance.min()), 1e-9) ** 2, fewest, MOST_SAMPLES))
-            all_samples, few = _area_samples(light, count), _area_samples(light, sources.FEW)
-            pitch = np.sqrt(area / all_samples.count)
-            if (close := float((distance < pitch).mean())) > WORTH_SAYING:
-                doubts.append(f"{close:.1%} of the surface is within {pitch:.2g} of an area light at {light.center_m}, nearer than its "
-                              "samples are apart: its light shows them there")
+            all_samples, doubt = _fine_samples(light, surface)
+            few = _area_samples(light, sources.FEW)
+            doubts += [] if doubt is None else [doubt]
         samples, places = grouped(all_samples, np.ones(all_samples.count, dtype=bool), first_row, most=NEAR_MARCHES, reach=ANYWHERE)
         first_row += len(places)
         fine.append(samples)
         coarse.append(few)
         marched.append(places)
     return NearLights(join(fine), join(coarse), np.concatenate(marched), tuple(doubts))
+
+
+def _fine_samples(light: SphereLight | RectangleLight, surface: np.ndarray) -> tuple[Sources, str | None]:
+    """Return samples of an area light as far apart as the surface asks for, and a sentence where it is nearer than they are apart."""
+    area, distance = _extent(light, surface)
+    fewest = sources.SPHERE_SAMPLES if isinstance(light, SphereLight) else sources.RECTANGLE_SAMPLES
+    with np.errstate(divide="ignore"):  # a surface that touches the light
+        count = int(np.clip(4 * area / distance.min() ** 2, fewest, MOST_SAMPLES))
+    samples = _area_samples(light, count)
+    pitch = np.sqrt(area / samples.count)
+    close = float((distance < pitch).mean())
+    if close <= WORTH_SAYING:
+        return samples, None
+    return samples, (f"{close:.1%} of the surface is within {pitch:.2g} m of an area light at {light.center_m}, nearer than its samples "
+                     "are apart: its light shows them there")
 
 
 def _area_samples(light: SphereLight | RectangleLight, count: int) -> Sources:

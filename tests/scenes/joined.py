@@ -50,8 +50,3 @@ def drifting(normal: np.ndarray, *, noise: float, drift: float, seed: int = 0) -
     smooth = np.radians(drift) * np.stack([np.sin(across) * np.cos(down), np.cos(across / 2), np.zeros((rows, cols))])
     found = normal + smooth + np.radians(noise) * np.random.default_rng(seed).standard_normal(normal.shape)
     return found / np.linalg.norm(found, axis=0)
-
-
-def degrees_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Angles between unit vectors [3, …]."""
-    return np.degrees(np.arccos(np.clip((one * other).sum(axis=0), -1, 1)))

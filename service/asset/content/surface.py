@@ -1,5 +1,6 @@
 """Solved maps as an asset has them, whatever its format, with their camera; reports of writers, and findings of relit inspect."""
 
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -73,6 +74,12 @@ def unit_in_metres(camera: Camera) -> float:
     return 1.0 if camera.metric else UNIT_WITHOUT_SCALE_M
 
 
+LENGTH_TOLERANCE = 0.01
+"""The largest deviation of the length of a normal from 1: more than halves and bytes round."""
+NUMBERS = re.compile(r":(specular_roughness|roughness|metallic|base_metalness|occlusion|opacity|displacement|clearcoat|geometry_normal)$")
+"""Inputs of materials that take numbers, as the names of textures end with them; OpenUSD's validators look at the input normal."""
+COLOURS = re.compile(r":(diffuseColor|emissiveColor|specularColor|base_color)$")
+"""Inputs of materials that take colours."""
 READABLE = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
 """Images that can be read unless they are damaged."""
 
@@ -115,6 +122,28 @@ def image_facts(data: bytes, name: str) -> dict[str, Any]:
     image.close()
     return {"bytes": len(data), "resolution": [spec.width, spec.height], "channels": spec.nchannels, "depth": str(spec.format),
             **({} if whole else damaged)}
+
+
+def length_fault(vectors: np.ndarray) -> str | None:
+    """Return how many of some vectors [n, 3], which should be directions, are not of length 1, or None where all are."""
+    lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=1)
+    wrong = lengths[np.isfinite(lengths) & (abs(lengths - 1) > LENGTH_TOLERANCE)]
+    if not len(wrong):
+        return None
+    return f"{len(wrong)} of its {len(lengths)} values are not of length 1 but from {wrong.min():.4g} to {wrong.max():.4g} long"
+
+
+def texture_doubts(parts: Iterable[Part]) -> Iterator[str]:
+    """Yield a sentence for each texture of a USD asset whose values are read as if they were encoded for a display though they are numbers,
+    or the other way round: `auto` takes images of 8 bits with three or four channels for sRGB (UsdUVTexture)."""
+    for part in parts:
+        space = str(part.facts.get("color_space") or "").lower()
+        bytes_of_colour = part.facts.get("depth") == "uint8" and part.facts.get("channels", 0) >= 3
+        file = part.facts.get("file")
+        if part.kind == "texture" and NUMBERS.search(part.name) and ("srgb" in space or (space == "auto" and bytes_of_colour)):
+            yield f"{part.name}: {file} is read as sRGB (its colour space is {space}), and this input takes numbers: set it to raw"
+        elif part.kind == "texture" and COLOURS.search(part.name) and space == "raw" and bytes_of_colour:
+            yield f"{part.name}: {file} is read as raw, and colours of 8 bits are mostly sRGB, then shown too bright: set it to sRGB"
 
 
 def texture_faults(parts: Iterable[Part]) -> Iterator[str]:

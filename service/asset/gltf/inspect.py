@@ -4,10 +4,11 @@ Source: glTF 2.0 Specification, 3.6 "Binary Data Storage", 4.4 "Binary glTF Layo
 """
 
 import math
+from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote, unquote_to_bytes
 
 from pygltflib import GLTF2, POINTS, TRIANGLES
 
@@ -77,7 +78,16 @@ def _materials(path: Path, contents: GlbContents) -> Iterator[Part]:
 def _image(path: Path, contents: GlbContents, number: int) -> dict[str, Any]:
     """Return the facts of an image within the file, or the name of one beside it."""
     image = contents.document.images[number]
-    name, kind = image.name or image.uri or f"image {number}", (image.mimeType or "").rpartition("/")[2]
+    head, _, text = (image.uri or "").partition(",")
+    within = head.startswith("data:")
+    kind = (head.removeprefix("data:").partition(";")[0] if within else image.mimeType or "").rpartition("/")[2]
+    name = image.name or (None if within else image.uri) or f"image {number}"
+    if within:
+        try:
+            data = b64decode(text, validate=True) if head.endswith(";base64") else unquote_to_bytes(text)
+        except ValueError:  # no base64
+            data = b""
+        return {"file": name, **image_facts(data, f"{name}.{kind}")}
     if image.bufferView is None:
         return {"file": name}
     view = contents.document.bufferViews[image.bufferView]

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
-from service.asset.content.surface import Inspection, Part, image_facts, texture_faults
+from service.asset.content.surface import Inspection, Part, image_facts, texture_doubts, texture_faults
 from service.asset.usd.files import reason_of
-from service.asset.usd.geometry_faults import geometry_faults
+from service.asset.usd.geometry_faults import geometry_doubts, geometry_faults
 from service.asset.usd.layers import PURPOSES
 from service.asset.usd.scene import APERTURE_UNIT
 from service.errors import AssetError
@@ -48,7 +48,9 @@ def inspect_usd(path: Path) -> Inspection:
             (errors if wrong else warnings).append(f"{found.GetName()}: {' '.join(found.GetMessage().split())}")
         errors += _hint_findings(usd_stage.GetDefaultPrim())
         errors += geometry_faults(usd_stage)
+        warnings += geometry_doubts(usd_stage)
     errors += texture_faults(parts.values())
+    warnings += texture_doubts(parts.values())
     layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
     beside = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]).resolve() for file in [*(layer.realPath for layer in layers), *files]}
     size = sum(file.stat().st_size for file in beside | {path.resolve()} if file.is_file())

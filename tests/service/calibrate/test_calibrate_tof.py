@@ -134,6 +134,20 @@ def test_sigma_of_a_pulsed_sweep_grows_away_from_its_distances(tmp_path):
 
 
 @pytest.mark.long
+def test_sigma_of_few_distances_holds_what_chance_makes_of_their_scatter(tmp_path):
+    """Distances measured to 5 mm. Two of three are fitted by any line: by the root of their squares alone one in eight is beyond 5 σ."""
+    path = sweep(tmp_path, [(f"d{k}", depth, 0.05, None) for k, depth in enumerate((2.0, 3.5, 5.0))],
+                 lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
+    plan, random, off = json.loads(path.read_text()), np.random.default_rng(2), []
+    for _ in range(16):
+        steps = [{**step, "depth_m": step["depth_m"] + random.normal(0, 5e-3)} for step in plan["steps"]]
+        path.write_text(json.dumps({**plan, "steps": steps}))
+        found = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu")).calibration
+        off.append(abs(found.scale * 3.55 - found.offset_m - 3.5) / found.sigma_m)
+    assert max(off) < 5  # beyond it are 1 % of Student's t of one degree of freedom
+
+
+@pytest.mark.long
 def test_a_pulsed_camera_that_warms_up_on_the_way_has_the_scale_of_one_that_does_not(tmp_path):
     """It drifts by 20 mm while the target moves away by 7 m: fitted after the scale, the drift was 1 mm in 20 and the scale .28 % wrong.
     Noise of a distance is .1 mm, and slanting rays leave 1 mm."""

@@ -14,11 +14,12 @@ from benchmarks.trials.declared import surface
 from kernels.errors import ArrayError
 from kernels.status import Status
 from service.joining.depth_and_normals import Joined, join_depth
+from service.light_estimation.lambertian import degrees_between
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.marks import first_short
-from tests.scenes.joined import MM, View, degrees_between, drifting, see
+from tests.scenes.joined import MM, View, drifting, see
 
 LEAST_RATIO, NORMAL_RATIO = 0.5, 1.1
 """Largest error of the joined height over that of the depth, and of its normals over those that were given. The second is that of the

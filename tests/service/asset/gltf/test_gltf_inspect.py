@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+from base64 import b64encode
 
 import numpy as np
 import pytest
@@ -231,3 +232,52 @@ def test_attributes_of_other_lengths_and_accessors_that_are_not_there_are_errors
 
     assert "values of TEXCOORD_0" in inspect_glb(rewritten(written(tmp_path), shorter)).errors[0]
     assert "refers to accessor 99, which is not there" in inspect_glb(rewritten(written(tmp_path), absent)).errors[0]
+
+
+def attribute(document, name):
+    return document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
+
+
+@pytest.mark.parametrize("change, sentence", [
+    (lambda document: attribute(document, "POSITION").update(min=[-1, -1, -1]),
+     r"POSITION: min of its accessor is \(-1, -1, -1\), and that of"),
+    (lambda document: attribute(document, "POSITION")["max"].pop(), "POSITION: max of its accessor"),
+    (lambda document: attribute(document, "POSITION").pop("min"), "POSITION: its accessor has no min and max"),
+    (lambda document: document["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
+     "has no TEXCOORD_0, by which its material reads baseColorTexture, metallicRoughnessTexture, normalTexture"),
+    (lambda document: document["materials"][0]["normalTexture"].update(texCoord=1), "has no TEXCOORD_1, .* reads normalTexture"),
+    (lambda document: document["meshes"][0]["primitives"][0]["attributes"].update(NORMAL=document["meshes"][0]["primitives"][0][
+        "attributes"]["POSITION"]), r"NORMAL: (\d+) of its \1 values are not of length 1 but from"),
+])
+def test_what_a_document_says_wrongly_of_its_arrays_is_an_error(change, sentence, tmp_path):
+    errors = inspect_glb(rewritten(written(tmp_path), change)).errors
+    assert len(errors) == 1 and re.search(sentence, errors[0])
+
+
+@pytest.mark.parametrize("name, value, sentence", [
+    ("NORMAL", (0, 0, 0.5), "NORMAL: 1 of its .* values are not of length 1 but from 0.5 to 0.5 long"),
+    ("NORMAL", (0, 0, 1.005), None),  # as bytes and halves have it
+    ("TANGENT", (1, 0, 0, 0), "TANGENT: the fourth component of 1 of its"),
+])
+def test_directions_have_length_1(name, value, sentence, tmp_path):
+    path = written(tmp_path)
+    document, rest = chunks(path)
+    at, raw = 8 + document["bufferViews"][attribute(document, name)["bufferView"]].get("byteOffset", 0), np.float32(value).tobytes()
+    with_document(path, json.dumps(document).encode(), rest[:at] + raw + rest[at + len(raw):])
+    errors = inspect_glb(path).errors
+    assert len(errors) == (sentence is not None) and all(re.search(str(sentence), error) for error in errors)
+
+
+@pytest.mark.parametrize("kept, text", [(1, None), (0.5, None), (1, "%%%%")])
+def test_images_within_the_document_are_read(kept, text, tmp_path):
+    path = written(tmp_path)
+    document, rest = chunks(path)
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    data = rest[8 + view["byteOffset"]:][:view["byteLength"]]
+    uri = f"data:image/png;base64,{text or b64encode(data[:round(kept * len(data))]).decode()}"
+    found = inspect_glb(rewritten(path, lambda document: document["images"].__setitem__(0, {"uri": uri})))
+    whole = text is None and kept == 1
+    assert [each.partition(": ")[2] for each in found.errors] == (
+        [] if whole else ["image 0 is no image that can be read, or a damaged one"])
+    assert found.warnings == ()
+    assert found.parts[2].facts.get("resolution") == ([24, 24] if text is None else None)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from service.light_estimation.lambertian import degrees_between
 from service.scans.points.neighbours import NearestWithin, Neighbours
 from service.scans.points.planes import local_planes, robust_scatter
 from service.scans.points.rigid import applied, moved
 from service.scans.points.squares import squares_of
 from stage.capture.camera import Camera
-from tests.scenes.joined import degrees_between
 
 CAMERA = Camera(projection="perspective", resolution=(120, 90), focal_px=(400.0, 400.0))
 SIDE = 5
