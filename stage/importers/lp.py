@@ -52,8 +52,8 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     for (number, _), frame in zip(rows, frames, strict=True):
         before = named.setdefault(frame["image"], number)
         if before != number:
-            raise ManifestError(f"{path}: line {number}: names {frame['image']}, which line {before} names already: each light has an image "
-                                "of its own")
+            raise ManifestError(f"{path}: line {number}: names {frame['image']}, which line {before} names already: each light has an "
+                                "image of its own")
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
@@ -74,8 +74,8 @@ def _lengths(path: Path, frames: list[dict[str, Any]]) -> list[str]:
     lengths = np.linalg.norm([frame["light"]["direction"] for frame in frames], axis=1)
     if np.median(lengths) < NO_UNIT:
         return []
-    return [f"frames[].light.direction: the vectors of {path.name} are {lengths.min():.3g} to {lengths.max():.3g} long, as positions are, and "
-            "were taken as directions to far lights: if the lamps are near the object, relit import near-lights takes their positions"]
+    return [f"frames[].light.direction: the vectors of {path.name} are {lengths.min():.3g} to {lengths.max():.3g} long, as positions are, "
+            "and were taken as directions to far lights: if the lamps are near the object, relit import near-lights takes their positions"]
 
 
 def _find(source: Path) -> Path:
