@@ -111,7 +111,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
     if isinstance(solution, DecodedSolution):
         if not solution.estimated.any():
-            declared = [sentence for sentence in solution.warnings if sentence.startswith("frames: as declared")]
+            declared = [sentence for sentence in solution.warnings if sentence.startswith("frames:")]
             raise ManifestError(f"{capture.folder}: no pixel is decoded ({_reasons(solution)}): "
                                 f"{'; '.join(declared) or _advice(solution.counts(mask), using)}")
         refuse_unsure(solution.status, None, solution.confidence_map(), max_sigma=None, least_confidence=least)

@@ -41,13 +41,20 @@ WIDE = 8
 """Least mean width of the finer stripes, in pixels, that are compared with the coarser ones."""
 
 
+PAIRED, UNLIKE = 0.15, 0.3
+"""Largest difference of the sums of images and their inverses, over their median: encoded images of blurred stripes add up to an eighth
+more than those of sharp ones; and least median of their differences over their sums, of projectors that are brighter than the room."""
+FEWER_STEPS = 0.7
+"""Part of the steps between neighbouring stripes that are left where inverses are taken for the patterns, from which on they are these."""
+
+
 class Stripes(NamedTuple):
     """A Gray code, or a binary one, in the order of the images."""
 
     sequence: tuple[str, ...]
     """What the images show: columns, rows, white and black."""
     inverses: str
-    """pairs, blocks or none."""
+    """pairs, first, blocks or none, as of `GrayStack`."""
     fine_first: bool
     column_bits: int
     row_bits: int
@@ -90,8 +97,37 @@ class Pictures:
             return False
         sample = self._lines()[2][at]
         sums = sample[: len(at) // count * count].reshape(-1, count, sample.shape[1]).sum(axis=1)
+        lit = self._lit()
+        sums = sums[..., lit] if lit.sum() >= LEAST_LIT else sums
         scale = float(np.median(sums[0]))
         return scale > 0 and bool((np.median(np.abs(sums[1:] - sums[0]), axis=1) <= part * scale).all())
+
+    def inverses_in_pairs(self, names: Sequence[str]) -> bool:
+        """Return whether each second of these images looks like the inverse of the one before: their sums are alike, and they are not."""
+        if len(names) < 4 or not self.steady_sums(names, 2, PAIRED):
+            return False
+        sample = self._lines()[2][[self.names.index(name) for name in names]][:, self._lit()]
+        one, other = sample[: len(names) // 2 * 2 : 2], sample[1::2]
+        return float(np.median(np.abs(one - other) / np.maximum(one + other, 1e-12))) > UNLIKE
+
+    def _lit(self) -> np.ndarray:
+        """Return where the images change by far more than noise, [pixels] of the sample, bool."""
+        sample = self._lines()[2]
+        top = sample.max(axis=0)
+        return np.asarray(top - sample.min(axis=0) > CONTRAST * np.percentile(top, 99))
+
+    def inverse_first(self, columns: Sequence[tuple[int, int]], rows: Sequence[tuple[int, int]]) -> bool:
+        """Return whether the second images of pairs are the patterns of a Gray code, and the first ones their inverses: neighbouring
+        stripes then follow each other. `columns`, `rows`: the images of each pair, from coarse to fine."""
+        steps = np.zeros(2)
+        for lines, pairs in zip(self._lines()[:2], (columns, rows), strict=True):
+            steps += _steps(lines, pairs, float(lines.max()) * CONTRAST)
+        return bool(steps[1] < FEWER_STEPS * steps[0])
+
+    def brighter(self, first: str, second: str) -> bool:
+        """Return whether one image is brighter than another over what is lit."""
+        one, other = (self._lines()[2][self.names.index(name)][self._lit()] for name in (first, second))
+        return float(one.sum()) > float(other.sum())
 
     def bright_sides(self) -> np.ndarray:
         """Return the centre of the light in each image, x to the right and y up, [images, 2]."""
@@ -126,8 +162,7 @@ class Pictures:
         if len(self.names) < 4:
             return None
         across, down, sample = self._lines()
-        top, low = sample.max(axis=0), sample.min(axis=0)
-        lit = top - low > CONTRAST * np.percentile(top, 99)
+        top, low, lit = sample.max(axis=0), sample.min(axis=0), self._lit()
         if lit.sum() < LEAST_LIT:
             return None
         shown = (sample - low)[:, lit] / (top - low)[lit]
@@ -160,6 +195,8 @@ class Pictures:
         starts += [("white", index) for index in white] + [("black", index) for index in black]
         lengths = {axis: len(run) for axis, run in runs}
         together = [_together((across if axis else down)[plain], run if fine[0] else run[::-1], top.max() * CONTRAST) for axis, run in runs]
+        if pairs and self.inverse_first(*([(plain[k], plain[k + 1]) for k in (run if fine[0] else run[::-1])] for _, run in runs)):
+            inverses = "first"
         return Stripes(tuple(name for name, _ in sorted(starts, key=lambda start: start[1])), inverses, not fine[0],
                        lengths.get(True, 0), lengths.get(False, 0), max(together) > 0.5)
 
@@ -173,6 +210,26 @@ def _flips(lines: np.ndarray, least: float) -> np.ndarray:
         bits = lines[:, line, seen] > (top + low)[line, seen] / 2
         found += (bits[:, 1:] != bits[:, :-1]).sum(axis=1)
     return found / lines.shape[1]
+
+
+def _steps(lines: np.ndarray, pairs: Sequence[tuple[int, int]], least: float) -> np.ndarray:
+    """Return how far the stripes of neighbouring pixels lie apart in all, with the first images of pairs as the patterns of a Gray code and
+    with the second; `pairs` are the images from coarse to fine."""
+    seen = np.ptp(lines, axis=0) > least
+    both = seen[:, 1:] & seen[:, :-1]
+    wide: list[np.ndarray] = []
+    for first, second in pairs:
+        bits = lines[first] > lines[second]
+        if ((bits[:, 1:] != bits[:, :-1]) & both).sum() * WIDE > both.sum():
+            break
+        wide.append(bits)
+    if not wide:
+        return np.zeros(2)
+    steps = []
+    for bits in (np.stack(wide), ~np.stack(wide)):
+        numbers = np.tensordot(1 << np.arange(len(wide))[::-1], np.logical_xor.accumulate(bits, axis=0), 1)
+        steps.append(np.abs(np.diff(numbers, axis=1))[both].sum())
+    return np.array(steps, dtype=np.float64)
 
 
 def _together(lines: np.ndarray, run: list[int], least: float) -> float:

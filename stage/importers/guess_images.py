@@ -2,13 +2,14 @@
 
 import re
 import shlex
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import words_of
-from stage.importers.content import SMOOTH, Pictures, Stripes
+from stage.importers.content import SMOOTH, Pictures
 from stage.importers.folder import UNKNOWN_LIGHTS, Folder, Guess, arrays_of, encoding, made, spelling
 from stage.importers.pattern_order import GrayStack
 from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
@@ -20,6 +21,8 @@ STEADY = 0.05
 """Largest difference of the sums of images over their median at which they count as an image and its inverse, or as steps of a wave."""
 ONE_PERIOD, MANY_PERIODS = 1.3, 4
 """Most periods that an image shows of a wave over the whole projector, and least ratio of the periods of both waves of SLStudio's 2x3."""
+CENTRED = 0.06
+"""Farthest that principal points of projectors lie from the middle of their columns, as a part of these: lenses are shifted upwards."""
 METRES = 5.0
 """Distances of a camera from its projector that are longer are in millimetres."""
 FOLLOWED = 0.5
@@ -84,9 +87,13 @@ def gray(folder: Folder, shown: Pictures) -> Guess | None:
         bits = f"{stripes.column_bits} bits of columns and {stripes.row_bits} of rows"
         raise ManifestError(f"{folder.path}: looks like a plain binary code, {bits}, whose stripes have edges in common: relit import "
                             "reads Gray codes; docs/capture.md shows the pattern binary")
-    words, assumed, sure = _rig(folder, stripes)
+    bits_of = {"columns": stripes.column_bits, "rows": stripes.row_bits}
+    words, assumed, sure = _rig(folder, lambda size: all(bits in (0, (side - 1).bit_length())
+                                                         for bits, side in zip(bits_of.values(), size, strict=True)),
+                                " and ".join(f"{bits} bits of {name}" for name, bits in bits_of.items() if bits))
     plain = ("columns", "rows", "white", "black")
-    inverses = {"pairs": "each second of which is the inverse of the one before", "blocks": "whose inverses follow all of an axis",
+    inverses = {"pairs": "each second of which is the inverse of the one before",
+                "first": "each first of two of which is the inverse of the one behind it", "blocks": "whose inverses follow all of an axis",
                 "none": "without inverses"}[stripes.inverses]
     coded = " and ".join(part for part in plain[:2] if part in stripes.sequence)
     reason = f"{len(shown.names)} images of {coded} in two levels, {inverses}"
@@ -101,41 +108,60 @@ def gray(folder: Folder, shown: Pictures) -> Guess | None:
 
 def _half_lit(folder: Folder, shown: Pictures) -> Guess | None:
     """Return that images are in OpenCV's order by their number and inverses, where the object shows too little of the coarse stripes."""
-    names = [f"{width}x{height}" for width, height in PROJECTORS if len(GrayStack().entries((width, height))) == len(shown.names)]
-    if not names or shown.others or not shown.steady_sums(shown.names[:-2], 2, STEADY):
-        return None
-    return made("a Gray code in OpenCV's order", f"{len(shown.names)} images, each second of which is the inverse of the one before",
-                ["opencv-gray", folder.path, "--projector", names[0]], folder.path, solve=False, sure=True,
-                assumed=(f"the projector has {' or '.join(names)} pixels: these have as many bits",))
-
-
-def _rig(folder: Folder, stripes: Stripes) -> tuple[list[object], tuple[str, ...], bool]:
-    """Return the options for the projector of a code and its calibration, what they assume, and whether the number of bits fits them."""
     def fits(size: tuple[int, int]) -> bool:
-        return all(bits in (0, (side - 1).bit_length()) for bits, side in zip((stripes.column_bits, stripes.row_bits), size, strict=True))
+        return len(GrayStack().entries(size)) == len(shown.names)
 
+    if not any(map(fits, PROJECTORS)) or shown.others or not shown.inverses_in_pairs(shown.names[:-2]):
+        return None
+    words, assumed, _ = _rig(folder, fits, "")
+    pairs = [(at, at + 1) for at in range(0, len(shown.names) - 2, 2)]
+    bits = (int(str(words[1]).partition("x")[0]) - 1).bit_length()
+    first, exchanged = shown.inverse_first(pairs[:bits], pairs[bits:]), shown.brighter(shown.names[-1], shown.names[-2])
+    reason = f"{len(shown.names)} images, of each two of which one is the inverse of the other"
+    if first or exchanged:
+        sequence = "columns,rows,black,white" if exchanged else "columns,rows,white,black"
+        return made("a Gray code", reason, ["gray", folder.path, *words, "--sequence", sequence, "--inverses",
+                                            "first" if first else "pairs"], folder.path, solve=False, sure=True, assumed=assumed)
+    return made("a Gray code in OpenCV's order", reason, ["opencv-gray", folder.path, *words], folder.path, solve=False, sure=True,
+                assumed=assumed)
+
+
+def _rig(folder: Folder, fits: Callable[[tuple[int, int]], bool], told: str) -> tuple[list[object], tuple[str, ...], bool]:
+    """Return the options for the projector of a code and its calibration, what they assume, and whether the number of bits fits them.
+    `fits`: whether a size of the projector has as many bits as the images, which show `told`."""
     for path in folder.with_suffix(".xml", ".yml", ".yaml", ".json"):
         matrices = arrays_of(path)
         if not set(PROJECTOR_MATRIX) & set(matrices):
             continue
-        size = projector_size(path)
+        size = projector_size(path) or _centred(matrices, [size for size in PROJECTORS if fits(size)])
         moved = next((matrices[name] for name in ("T", "Tp", "trans", "translation") if name in matrices), None)
         metres = moved is not None and float(np.linalg.norm(moved)) < METRES
         if size is not None and fits(size):
+            middle = () if projector_size(path) is not None else (
+                f"the projector has {size[0]}x{size[1]} pixels: these have as many bits, and {path.name} has its principal point near the "
+                "middle of their columns",)
             return (["--projector", f"{size[0]}x{size[1]}", "--calibration", path, "--unit-m", "1" if metres else "0.001"],
-                    (f"the calibration is in {'metres' if metres else 'millimetres'}, as the distance of the projector suggests",), True)
+                    (*middle, f"the calibration is in {'metres' if metres else 'millimetres'}, as the distance of the projector suggests"),
+                    True)
     sizes = [f"{width}x{height}" for width, height in PROJECTORS if fits((width, height))]
     if not sizes:
-        bits_of = {"columns": stripes.column_bits, "rows": stripes.row_bits}
-        told = " and ".join(f"{bits} bits of {name}" for name, bits in bits_of.items() if bits)
         return ["--projector", "WIDTHxHEIGHT"], (f"WIDTHxHEIGHT is the projector in pixels; the images show {told}",), False
     return ["--projector", sizes[0]], (f"the projector has {' or '.join(sizes)} pixels: these have as many bits",), True
+
+
+def _centred(matrices: Mapping[str, np.ndarray], sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+    """Return the size of a projector in the middle of whose columns the principal point of its matrix lies; None of none."""
+    matrix = next(matrices[name] for name in PROJECTOR_MATRIX if name in matrices)
+    if matrix.shape != (3, 3):
+        return None
+    away = [abs(float(matrix[0, 2]) / width - 0.5) for width, _ in sizes]
+    return sizes[away.index(min(away))] if min(away, default=1.0) < CENTRED else None
 
 
 def phase(folder: Folder, shown: Pictures) -> Guess | None:
     """Return that images are steps of waves."""
     count = len(folder.pictures)
-    if shown.steady_sums(shown.names, 2, STEADY):  # images and their inverses
+    if shown.inverses_in_pairs(shown.names):
         return None
     for steps in range(3, MOST_STEPS + 1):
         if count % steps == 0 and count > steps and shown.steady_sums(shown.names, steps, STEADY):

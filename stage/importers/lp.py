@@ -26,6 +26,9 @@ from stage.importers.layout import (
 )
 from stage.model import name_fault
 
+NO_UNIT = 2.0
+"""Median length of the vectors of a file from which on they are no directions: those are one long, or a little off that by rounding."""
+
 
 def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None,
                   white: float | None = None) -> Path:
@@ -45,6 +48,12 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     frames = [_frame(path, folder, beside, number, row, irradiance) for number, row in rows]
     if not frames:
         raise ManifestError(f"{path}: names no image")
+    named: dict[str, int] = {}
+    for (number, _), frame in zip(rows, frames, strict=True):
+        before = named.setdefault(frame["image"], number)
+        if before != number:
+            raise ManifestError(f"{path}: line {number}: names {frame['image']}, which line {before} names already: each light has an "
+                                "image of its own")
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
@@ -52,12 +61,21 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     return write_capture({
         "name": path.stem,
         "color_space": space,
-        "assumed": assumed_encoding(space, color_space),
+        "assumed": [*assumed_encoding(space, color_space), *_lengths(path, frames)],
         "camera": (view or View()).entry(resolution),
         "mask": mask,
         "irradiance_scale": scale,
         "frames": frames,
     }, path, destination)
+
+
+def _lengths(path: Path, frames: list[dict[str, Any]]) -> list[str]:
+    """Return the sentence for vectors that are as long as positions are."""
+    lengths = np.linalg.norm([frame["light"]["direction"] for frame in frames], axis=1)
+    if np.median(lengths) < NO_UNIT:
+        return []
+    return [f"frames[].light.direction: the vectors of {path.name} are {lengths.min():.3g} to {lengths.max():.3g} long, as positions are, "
+            "and were taken as directions to far lights: if the lamps are near the object, relit import near-lights takes their positions"]
 
 
 def _find(source: Path) -> Path:

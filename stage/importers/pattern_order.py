@@ -29,7 +29,8 @@ class GrayStack:
     sequence: tuple[str, ...] = ("columns", "rows", "white", "black")
     """The order of the parts: members of PARTS, each at most once."""
     inverses: str = "pairs"
-    """`pairs`: each image is followed by its inverse; `blocks`: all images of an axis, then their inverses; `none`."""
+    """`pairs`: each image is followed by its inverse; `first`: each image follows its inverse; `blocks`: all images of an axis, then their
+    inverses; `none`."""
     fine_first: bool = False
     """True if the finest stripes are shown first; else the coarsest."""
     column_bits: int | None = None
@@ -62,8 +63,9 @@ def gray_entries(axis: str, size: int, given: int | None, *, inverses: str, fine
     order = range(bits) if fine_first else reversed(range(bits))
     plain = [{"code": "gray", "axis": axis, "bit": bit, "bits": bits, **stripe} for bit in order]
     inverted = [{**entry, "inverse": True} for entry in plain]
-    if inverses == "pairs":
-        return [entry for pair in zip(plain, inverted, strict=True) for entry in pair]
+    if inverses in ("pairs", "first"):
+        pairs = zip(plain, inverted, strict=True) if inverses == "pairs" else zip(inverted, plain, strict=True)
+        return [entry for pair in pairs for entry in pair]
     return [*plain, *inverted] if inverses == "blocks" else plain
 
 

@@ -19,7 +19,7 @@ from service.depth.patterns.readings import Readings, grey_of
 from service.depth.patterns.swing import exponent_of_swing
 from stage.capture.camera import Camera
 from stage.errors import StageError
-from stage.patterns.base import Axis
+from stage.patterns.base import Axis, UniformPattern
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, Pattern, collect
 from stage.patterns.kary import KaryCode
@@ -41,6 +41,8 @@ CLEAR_SHARE, CLEAR_TIMES = 0.4, 2.0
 UNEVEN, LARGEST_STEP = 0.01, 0.05
 """Mean distance of neighbouring pixels in the projector, as a part of its extent, above which other readings are tried, and the distance
 that pixels which are farther apart count with."""
+MOST_BRIGHTER = 0.9
+"""Part of the lit pixels at which black is brighter than white, from which on the two are named as exchanged."""
 AXES: tuple[Axis, Axis] = ("column", "row")
 NOT_LIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
 """Statuses of pixels that cannot tell whether the frames are declared rightly."""
@@ -120,6 +122,12 @@ def _changed(**fields: Callable[[Any], Any]) -> Callable[[list[Pattern]], list[P
     return lambda patterns: [change(pattern) for pattern in patterns]
 
 
+def _around(patterns: list[Pattern]) -> list[Pattern]:
+    """Return patterns with white and black, which end or begin the sequence, at the other end of it."""
+    ends, begins = (all(isinstance(pattern, UniformPattern) for pattern in two) for two in (patterns[-2:], patterns[:2]))
+    return [*patterns[-2:], *patterns[:-2]] if ends else [*patterns[2:], *patterns[:2]] if begins else patterns
+
+
 READINGS = (
     Reading("patterns and inverses are exchanged: check inverse in the frames' patterns",
             _changed(inverse=lambda p: not p.inverse)),
@@ -132,6 +140,7 @@ READINGS = (
     Reading("the images are in reverse order: check image in frames", lambda patterns: patterns[::-1]),
     Reading("the images are one frame late: check image in frames", lambda patterns: [*patterns[1:], patterns[0]]),
     Reading("the images are one frame early: check image in frames", lambda patterns: [patterns[-1], *patterns[:-1]]),
+    Reading("the images of white and black are at the other end of the sequence: check image in frames", _around),
     Reading("the projected image is mirrored: check the projector's settings and projector.camera_from_projector", list, True),
 )
 
@@ -190,6 +199,18 @@ def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], boo
                     yield found, reading
         except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
             continue
+
+
+def check_references(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
+    """Return a sentence if black is brighter than white at most of the pixels that differ."""
+    if collected.white is None or collected.black is None:
+        return None
+    even = sample.grey[[collected.white, collected.black]]
+    brighter = (even[1] > even[0])[sample.lit(even, noise)]
+    if len(brighter) < ENOUGH or brighter.mean() < MOST_BRIGHTER:
+        return None
+    return (f"frames: black is brighter than white at {100 * brighter.mean():.0f} % of the lit pixels: exchange the images of the frames "
+            "white and black")
 
 
 def check_declaration(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,

@@ -26,7 +26,15 @@ from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_no
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.moved import moved_pixels
-from service.depth.patterns.pattern_checks import Sample, check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
+from service.depth.patterns.pattern_checks import (
+    Sample,
+    check_declaration,
+    check_references,
+    check_unevenness,
+    find_exponent,
+    response_sentence,
+    sample_of,
+)
 from service.depth.patterns.projector_doubts import contradicted, widen
 from service.depth.patterns.ramp_checks import check_ramps
 from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
@@ -189,7 +197,7 @@ def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, proje
              frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
     """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels and ramps are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
-    wrong = check_order(sample, codes.collected, noise) or (
+    wrong = check_references(sample, codes.collected, noise) or check_order(sample, codes.collected, noise) or (
         check_unevenness(sample, patterns, shown, noise, device) if projector is None
         else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)

@@ -100,6 +100,7 @@ class Inverses(Choice):
     """The place of the inverse images of a Gray code."""
 
     PAIRS = "pairs", "each image is followed by its inverse"
+    FIRST = "first", "each image follows its inverse"
     BLOCKS = "blocks", "all images of an axis, then their inverses"
     NONE = "none", "there are none"
 

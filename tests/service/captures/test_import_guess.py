@@ -157,15 +157,16 @@ def test_auto_imports_what_is_sure_and_nothing_else(relit, tmp_path, layout):
     assert not (tmp_path / "capture" / "capture.previous.json").exists()  # the same again replaces nothing
 
 
-def blurred_stripes(sequence, *, inverses, fine_first, gray=1):
+def blurred_stripes(sequence, *, inverses, fine_first, gray=1, bits=(8, 7)):
     """Blurred stripes, with noise and gamma, on a surface of two albedos that the projector lights in part, 100 by 128 pixels."""
     random, images, (v, u) = np.random.default_rng(8), [], np.mgrid[:100, :128]
     albedo = np.where((u // 23 + v // 17) % 2, 0.9, 0.3) * ((u > 8) & (v < 92))
     for part in sequence:
-        at, bits = {"columns": ((u + 6 * np.sin(v / 30)).astype(int) + 10, 8), "rows": (v + 5, 7)}.get(part, (None, 1))
-        order = range(bits) if fine_first else reversed(range(bits))
+        at, count = {"columns": ((u + 6 * np.sin(v / 30)).astype(int) + 10, bits[0]), "rows": (v + 5, bits[1])}.get(part, (None, 1))
+        order = range(count) if fine_first else reversed(range(count))
         plain = [np.full(u.shape, part == "white") if at is None else ((at ^ at >> 1) if gray else at) >> bit & 1 > 0 for bit in order]
-        turned = {"none": [plain], "blocks": [plain, [~one for one in plain]], "pairs": [[k for one in plain for k in (one, ~one)]]}
+        turned = {"none": [plain], "blocks": [plain, [~one for one in plain]], "pairs": [[k for one in plain for k in (one, ~one)]],
+                  "first": [[k for one in plain for k in (~one, one)]]}
         shown = [one for group in turned[inverses] for one in group] if at is not None else plain
         for one in shown:
             light = albedo * (0.08 + 0.8 * gaussian_filter(one.astype(float), 0.6)) + random.normal(0, 0.004, u.shape)
@@ -175,7 +176,7 @@ def blurred_stripes(sequence, *, inverses, fine_first, gray=1):
 
 @pytest.mark.parametrize(("sequence", "inverses", "fine_first"), [
     ("white,black,columns", "none", False), ("rows,columns,black,white", "pairs", True), ("columns,rows", "blocks", False),
-    ("columns", "pairs", False)])
+    ("columns", "pairs", False), ("columns,rows,white,black", "first", False), ("rows,black,white", "first", True)])
 def test_codes_are_told_from_the_images_alone(relit, tmp_path, sequence, inverses, fine_first):
     """Names say nothing; the command has the order, the inverses and the bits that were shown."""
     for number, image in enumerate(blurred_stripes(sequence.split(","), inverses=inverses, fine_first=fine_first)):
@@ -184,6 +185,39 @@ def test_codes_are_told_from_the_images_alone(relit, tmp_path, sequence, inverse
     run = next(line for line in out.splitlines() if line.startswith("run"))
     assert f"--sequence {sequence} --inverses {inverses}" in run and ("--fine-first" in run) == fine_first
     assert "8 bits of columns" in out if "columns" in sequence else "bits of columns" not in out
+
+
+@pytest.mark.parametrize("inverses", ["pairs", "first"])
+@pytest.mark.parametrize("even", ["white,black", "black,white"])
+def test_codes_on_a_small_object_are_told(relit, tmp_path, even, inverses):
+    """The coarse stripes cover an object on an eighth of the image, before darkness, as a whole: all is told by the other stripes."""
+    near = np.hypot(*(np.mgrid[:100, :128] - np.array([50, 40])[:, None, None])) < 22
+    images = blurred_stripes(["columns", "rows", *even.split(",")], inverses=inverses, fine_first=False, bits=(10, 9))
+    for number, image in enumerate(images):
+        write_image(tmp_path / f"{number:03d}.png", np.where(near, image, 3).astype(np.uint8))
+    out = relit("import", "guess", tmp_path).well()
+    if (even, inverses) == ("white,black", "pairs"):
+        assert "relit import opencv-gray" in out
+    else:
+        assert f"--sequence columns,rows,{even} --inverses {inverses}" in out
+
+
+def test_waves_on_a_small_object_are_told(relit, tmp_path):
+    near = np.hypot(*(np.mgrid[:U.shape[0], :U.shape[1]] - np.array([30, 40])[:, None, None])) < 16
+    write_stack(tmp_path, [wave(U, period, -step / 4) * near for period in (16, 18, 21) for step in range(4)])
+    assert "looks    like phase shifts" in relit("import", "guess", tmp_path).well()
+
+
+def test_the_principal_point_tells_the_projector(relit, tmp_path):
+    """Both 854 and 640 columns have ten bits; the calibration says no size."""
+    images = blurred_stripes(["columns", "rows", "white", "black"], inverses="pairs", fine_first=False, bits=(10, 9))
+    for number, image in enumerate(images):
+        write_image(tmp_path / f"{number:03d}.png", image)
+    (tmp_path / "rig.json").write_text(json.dumps({
+        "M1": [[200, 0, 64], [0, 200, 50], [0, 0, 1]], "M2": [[700, 0, 322], [0, 700, 400], [0, 0, 1]], "R": np.eye(3).tolist(),
+        "T": [150, 0, 0]}))
+    out = relit("import", "guess", tmp_path).well()
+    assert "--projector 640x480 --calibration" in out and "principal point near the middle" in out
 
 
 def binary(folder):

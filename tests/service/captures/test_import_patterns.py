@@ -77,7 +77,7 @@ COLUMN_M = 0.065
 """Metres of depth that a projector column is worth here, at most."""
 
 
-@pytest.mark.parametrize("layout", ["references first, no inverses", "inverses in blocks, fine first", "fewer bits",
+@pytest.mark.parametrize("layout", ["references first, no inverses", "inverses first", "inverses in blocks, fine first", "fewer bits",
                                     "OpenCV's, as a scanner"])
 def test_gray_codes(relit, tmp_path, layout):
     calibration = write_calibration(tmp_path / "rig.yml", OPENCV)
@@ -90,6 +90,9 @@ def test_gray_codes(relit, tmp_path, layout):
     elif layout == "inverses in blocks, fine first":
         write_stack(tmp_path, [gray(U, bit, inverse=turned) for turned in (False, True) for bit in reversed(columns)], "IMG_{}.png", 8)
         maps, _ = depth_of(relit, tmp_path, "gray", "--sequence", "columns", "--inverses", "blocks", "--fine-first", *rig)
+    elif layout == "inverses first":
+        write_stack(tmp_path, [gray(U, bit, inverse=turned) for bit in columns for turned in (True, False)])
+        maps, _ = depth_of(relit, tmp_path, "gray", "--sequence", "columns", "--inverses", "first", *rig)
     elif layout == "fewer bits":
         write_stack(tmp_path, [gray(U, bit, 4, turned) for bit in range(4, -1, -1) for turned in (False, True)])
         maps, _ = depth_of(relit, tmp_path, "gray", "--sequence", "columns", "--column-bits", "5", *rig)
@@ -141,6 +144,20 @@ def test_a_phase_with_a_gray_code(relit, tmp_path):
     maps, _ = depth_of(relit, tmp_path, "phase", "--periods", "16", "--steps", "4", "--images", "phase_*", "--gray-images", "gray_*",
                        "--gray-stripe", "8", "--white", "even_0.png", "--black", "even_1.png", *rig)
     assert maps.mask[LIT].mean() > 0.97 and error(maps).max() < 0.2 * COLUMN_M
+
+
+@pytest.mark.parametrize("order", ["black, white", "white and black first"])
+def test_white_and_black_elsewhere_than_in_opencv_order_are_named(relit, tmp_path, order):
+    rig = ("--calibration", write_calibration(tmp_path / "rig.yml", OPENCV), "--unit-m", "0.001", "--projector", SIZE)
+    stripes = [gray(at, bit, inverse=turned) for at in (U, V) for bit in range(6, -1, -1) for turned in (False, True)]
+    write_stack(tmp_path, [*stripes, BLACK, WHITE] if order == "black, white" else [WHITE, BLACK, *stripes])
+    relit("import", "opencv-gray", tmp_path, *rig).well()
+    if order == "black, white":
+        relit("depth", tmp_path, "--out", tmp_path / "out").refused("black is brighter than white at 100 % of the lit pixels")
+    else:
+        relit("depth", tmp_path, "--out", tmp_path / "out")
+        said = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"]
+        assert any("white and black are at the other end of the sequence" in sentence for sentence in said)
 
 
 def test_stripes_wider_than_the_period_are_refused(relit, tmp_path):

@@ -194,7 +194,7 @@ def test_eight_bits_are_taken_as_srgb(tmp_path, suffix, dtype, space):
     (["3", "", GOOD[1], "", "b.jpg 0.6 0 up", GOOD[3]], r"dome\.lp: line 5: 'b\.jpg 0\.6 0 up' is not"),
     (["3", GOOD[1], "b.jpg 0 inf 1", GOOD[3]], r"dome\.lp: line 3"),
     (["3", GOOD[1], "b.jpg 0 0 0", GOOD[3]], r"dome\.lp: line 3: the light direction has zero length"),
-    (["3", GOOD[1], GOOD[2], GOOD[2]], r"dome\.lp: frames\[2\]\.image: b\.jpg is already the image of"),
+    (["3", GOOD[1], GOOD[2], GOOD[2]], r"dome\.lp: line 4: names b\.jpg, which line 3 names already"),
     (["3", GOOD[1], "x.jpg 0 0 1", GOOD[3]], r"x\.jpg is not in the folder"),
     (["3", "x.jpg 0 0 1", *GOOD[2:]], r"cannot read .*x\.jpg: no such file"),
     (["3", GOOD[1], "../e.jpg 0 0 1", GOOD[3]], r"\.\./e\.jpg leads out of the folder"),
@@ -205,6 +205,17 @@ def test_bad_lp_files_are_named_and_nothing_is_written(tmp_path, lines, words, i
     write_image(tmp_path / "e.jpg", np.zeros((4, 5, 3), np.uint8))
     with nothing_written(tmp_path, words, ManifestError, StorageError):
         lp.import_folder(tmp_path / "a", tmp_path / ("a" if in_place else "b"))
+
+
+def test_vectors_that_are_as_long_as_positions_are_said(tmp_path):
+    rti(tmp_path / "unit", GOOD)
+    lp.import_folder(tmp_path / "unit", tmp_path / "unit")
+    assert not any("positions" in words for words in Capture.open(tmp_path / "unit").manifest.assumed)
+    rti(tmp_path / "mm", ["3", "a 1.jpg 0.0 0.0 300", "b.jpg 210 0 280", "c.jpg 0 240 320"])
+    lp.import_folder(tmp_path / "mm", tmp_path / "mm")
+    capture = Capture.open(tmp_path / "mm").manifest
+    assert any("are 300 to 400 long, as positions are" in words for words in capture.assumed)
+    np.testing.assert_allclose(capture.frames[1].light.direction, (0.6, 0, 0.8), atol=1e-12)
 
 
 def test_no_lp_file(tmp_path):
