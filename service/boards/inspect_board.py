@@ -19,7 +19,7 @@ from service.boards.shared_deviation import SharedDeviation, shared_deviation
 from service.boards.stitching.form import bow_and_twist, fit_form, fit_spline
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
-from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
+from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over, too_wide
 from service.boards.stitching.significance import Scan, compare, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
 from service.boards.tiles import BoardTiles, read_tiles, without_hidden_outliers
@@ -180,6 +180,7 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     if smallest > min(grid.rows, grid.cols):
         raise BoardError(f"{nominal.path}: --smallest-defect-m {request.smallest_defect_m:g} is larger than the board")
     tolerance = tolerances_over(grid, nominal.regions, elsewhere_m=request.tolerance_m)
+    found.warnings.extend(too_wide(nominal.heights, nominal.regions, elsewhere_m=request.tolerance_m, smallest_m=smallest * grid.pixel_m))
     scan = scan_windows(deviation, tolerance_m=tolerance, false_alarm=request.false_alarm / 2, smallest_px=smallest)
     wanted = _asked(nominal.heights.measured, smallest)
     inspected = wanted & np.isfinite(scan.mean_sigma)  # a hole with enough measured pixels around it hides no defect

@@ -99,6 +99,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     design = read_design(request.design, UNITS_M[request.design_unit], device=device)
     scan = read_scanned(request.scan, UNITS_M[request.scan_unit], request.sigma_m)
     reach = request.reach_m or REACH * design.size
+    _check_limits(request, design, reach, regions, unit_m)
     timings.stage("place", 1)
     placement = _place(request, design, scan, reach, regions, unit_m)
     timings.stage("deviations", 1)
@@ -112,6 +113,9 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
                          least_seen=request.least_seen, one_pose=not placement.rivals)
     size = size_of(patches, placement.pivot)
     warnings = _warnings(scan, placement, found, size)
+    if design.turned_edges:
+        warnings.append(f"{request.design}: at {design.turned_edges} edges its faces turn their fronts opposite ways: points at faces that "
+                        "are turned inward are not compared; make its normals consistent")
     timings.stage("write", 1)
     span = span_of(found)
     colours = colours_of(found, span)
@@ -143,6 +147,19 @@ def _regions(request: CompareRequest) -> tuple[list[ToleranceRegion], float]:
         low, high = request.tolerance_m
         regions.append(ToleranceRegion(name=WHOLE, tolerance=(low / unit_m, high / unit_m)))
     return regions, unit_m
+
+
+def _check_limits(request: CompareRequest, design: Design, reach_m: float, regions: list[ToleranceRegion], unit_m: float) -> None:
+    """Refuse limits that no deviation which is looked for exceeds, and faults that are larger than the part."""
+    for region in regions:
+        low, high = (1e3 * limit * unit_m for limit in region.tolerance)
+        if min(-low, high) >= 1e3 * reach_m:
+            where = "--tolerance-m" if region.name == WHOLE else f"{request.regions}: region {region.name}"
+            raise RequestError(f"{where}: allows {low:+.4g} to {high:+.4g} mm, but deviations are looked for up to "
+                               f"{1e3 * reach_m:.3g} mm, so that nothing can fail: check their unit, or give a larger --reach-m")
+    if request.smallest_fault_m is not None and request.smallest_fault_m > design.size:
+        raise RequestError(f"--smallest-fault-m {request.smallest_fault_m:g}: is larger than the design, which is "
+                           f"{design.size:.3g} m large: give it in metres")
 
 
 def _place(request: CompareRequest, design: Design, scan: ScannedSurface, reach: float, regions: list[ToleranceRegion], unit_m: float

@@ -38,6 +38,19 @@ LARGER, SMALLER = 4.0, 0.02
 show a small piece of it."""
 LEAST_SHARE = 0.5
 """The least part of a scan that must lie on the design."""
+USUAL = 0.8
+"""Part of the points by whose largest distance from the design it is seen whether a scan is turned."""
+POOR = 3.0
+"""That distance in σ of a point, above which other ways to turn the scan are tried."""
+TURNED_BETTER = 2.0
+"""By which factor it must be smaller for a scan to be called turned: of a part that is its own mirror image it is the same."""
+MIRROR, AS_IT_IS = np.array([-1.0, 1.0, 1.0]), np.ones(3)
+TURNED = (
+    (AS_IT_IS, -1.0, "if its outside is taken for the inside (turn over the faces or the normals of the scan, or the faces of the design "
+                     "where that is an open surface)"),
+    (MIRROR, 1.0, "as its mirror image (check the axes of the scan, which may be left-handed, and that it is that part and not its twin)"),
+    (MIRROR, -1.0, "as its mirror image turned inside out (an axis of it, or of the design, was mirrored without turning the faces over)"))
+"""The factors of coordinates and of normals of scans that are turned, and the sentences about them."""
 HELD = 1e-3
 """A motion is not determined if it moves the points along their normals by less than the square root of this part of the motion that moves
 them most: it is held where it is. A cylinder of 64 flat sides has 8e-4 about its axis."""
@@ -77,20 +90,17 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
     drawn = np.random.default_rng(0).permutation(len(scan.points))
     if not SMALLER < scan.size / design.size < LARGER:
         raise ScanError(f"the scan does not lie on the design: {_sizes(design, scan)}")
-    starts = [np.eye(4)]
+    fitted = np.eye(4)
     rivals = 0
     coarse = design.size / CELLS_ACROSS
     if search:
-        rough, middle = _rough(design, scan)
-        tried = sorted((_settle(design, scan, drawn[:FEW], pose, (6 * coarse, 3 * coarse)) for pose in rough), key=lambda each: each[1])
-        better = _distinct(tried, middle, coarse)
-        finely = (_settle(design, scan, drawn[:SOME], pose, (3 * coarse, 1.5 * coarse, coarse)) for pose, _ in better)
-        found = sorted(finely, key=lambda each: each[1])
+        found, middle = _searched(design, scan, drawn, coarse)
         if not found:
             raise ScanError(f"the scan does not lie on the design: {_sizes(design, scan)}")
-        starts = [found[0][0]]
-        rivals = sum(score <= RIVAL * found[0][1] and not is_near(pose, starts[0], middle, 3 * coarse) for pose, score in found[1:])
-    fitted = starts[0]
+        least = found[0][1]
+        fitted = _closest(design, scan, drawn[:SOME], [pose for pose, score in found if score <= RIVAL * least], coarse)
+        _refuse_turned(design, scan, drawn, coarse, fitted)
+        rivals = sum(score <= RIVAL * least and not is_near(pose, fitted, middle, 3 * coarse) for pose, score in found)
     for reach in (1.5 * coarse, max(0.75 * coarse, reach_m), reach_m):
         step = _fit(design, scan, drawn[:MANY], fitted, reach)
         if step is None:
@@ -108,6 +118,49 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
         open_still = by_datum.open_still @ turn
         last = by_datum._replace(covariance=by_datum.covariance + open_still @ last.covariance @ open_still.T)
     return Placement(last.pose, last.pivot, last.covariance, rivals, last.held, _along_normals(design, scan, drawn[:SOME], last, reach_m))
+
+
+def _searched(design: Design, scan: ScannedSurface, drawn: np.ndarray, coarse: float) -> tuple[list[tuple[np.ndarray, float]], np.ndarray]:
+    """Return poses of a scan, the best first, with the mean square distances that they leave, and the middle of the scan."""
+    rough, middle = _rough(design, scan)
+    tried = sorted((_settle(design, scan, drawn[:FEW], pose, (6 * coarse, 3 * coarse)) for pose in rough), key=lambda each: each[1])
+    better = _distinct(tried, middle, coarse)
+    finely = (_settle(design, scan, drawn[:SOME], pose, (3 * coarse, 1.5 * coarse, coarse)) for pose, _ in better)
+    return sorted(finely, key=lambda each: each[1]), middle
+
+
+def _closest(design: Design, scan: ScannedSurface, rows: np.ndarray, poses: list[np.ndarray], coarse: float) -> np.ndarray:
+    """Return of poses that fit about as well the first, unless most points lie clearly closer to the design at another: points beside
+    edges and borders, which face another way than what is nearest, may be most of a mean square distance."""
+    most = [_most(design, scan, rows, pose, coarse) for pose in poses]
+    best = int(np.argmin(most))
+    return poses[best if most[best] < most[0] / RIVAL else 0]
+
+
+def _refuse_turned(design: Design, scan: ScannedSurface, drawn: np.ndarray, coarse: float, pose: np.ndarray) -> None:
+    """Raise ScanError if the mirror image of a scan, or the scan turned inside out, lies on the design far better than the scan does at a
+    pose."""
+    own = _most(design, scan, drawn[:SOME], pose, coarse)
+    if own <= POOR * float(np.median(scan.sigma)):
+        return
+    most, said = own, ""
+    for axes, sides, sentence in TURNED:
+        turned = scan._replace(points=scan.points * axes, normals=scan.normals * axes * sides)
+        poses = [each for each, _ in _searched(design, turned, drawn, coarse)[0]]
+        if poses:
+            nearer = _most(design, turned, drawn[:SOME], _closest(design, turned, drawn[:SOME], poses, coarse), coarse)
+            most, said = (nearer, sentence) if nearer < most / RIVAL else (most, said)
+    if most < own / TURNED_BETTER:
+        raise ScanError(f"the scan lies on the design only {said}: {USUAL:.0%} of its points then lie within {1e3 * most:.2g} mm of "
+                        f"it, and within {1e3 * own:.2g} mm as it is")
+
+
+def _most(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float) -> float:
+    """Return the distance from the design within which most points of a scan lie that face as it does; at most the reach."""
+    distance = np.full(len(rows), reach)
+    found = np.abs(_matched(design, scan, rows, pose, reach)[0].distance)
+    distance[:len(found)] = found
+    return float(np.quantile(distance, USUAL))
 
 
 def _rough(design: Design, scan: ScannedSurface) -> tuple[list[np.ndarray], np.ndarray]:

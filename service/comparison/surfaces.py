@@ -72,6 +72,8 @@ class Design:
         volume = float(np.einsum("fi,fi->", middle[:, 0], np.cross(middle[:, 1], middle[:, 2]))) / 6
         self.inward: bool = np.array_equal(np.sort(ahead, axis=None), np.sort(back, axis=None)) and volume < NO_VOLUME * self.size**3
         """The faces are closed, but their fronts do not turn outward."""
+        self.turned_edges: int = _turned_edges(welded)
+        """Number of edges between faces of which one turns its front the other way."""
 
     def sample(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points [count, 3] that lie evenly on the surface, always the same, and the faces [count] that they lie on."""
@@ -101,6 +103,14 @@ class Design:
         inside = far > ON_SURFACE * self.size
         across = np.where(inside[:, None], apart * (sign / np.maximum(far, 1e-300))[:, None], self.normals[face])
         return Offsets(near, np.where(inside, sign * far, (apart * self.normals[face]).sum(axis=1)), across, at, face)
+
+
+def _turned_edges(faces: np.ndarray) -> int:
+    """Return at how many edges more faces run one way than the other way by two: of consistent surfaces it is one, at a border."""
+    once = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+    start, end = once.reshape(-1), np.roll(once, -1, axis=1).reshape(-1)
+    _, edge = np.unique(np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1), axis=0, return_inverse=True)
+    return int((np.abs(np.bincount(edge.reshape(-1), np.where(start < end, 1, -1))) > 1).sum())
 
 
 def read_design(path: Path, unit_m: float, *, device: str) -> Design:

@@ -75,6 +75,21 @@ def tolerances_over(grid: BoardGrid, regions: Sequence[Region], *, elsewhere_m: 
     return out
 
 
+def too_wide(nominal: HeightMap, regions: Sequence[Region], *, elsewhere_m: float, smallest_m: float) -> list[str]:
+    """Return a sentence for limits that allow more than all of the relief, and than what they are for is wide: of another unit, or in order
+    to leave a region out.
+    `elsewhere_m`: deviation that is allowed anywhere. `smallest_m`: side of the smallest defect."""
+    relief = float(np.nanmax(nominal.height) - np.nanmin(nominal.height))
+    wide = [region for region in regions if min(-region.tolerance_m[0], region.tolerance_m[1]) > max(relief, *region.size_m)]
+    said = [f"--tolerance-m allows {elsewhere_m:g} m, more than the {relief:.3g} m of relief: what is missing is no defect; give metres"
+            ] if elsewhere_m > max(relief, smallest_m) else []
+    if wide:
+        low, high = wide[0].tolerance_m
+        said.append(f"regions: {len(wide)}, as {wide[0].name}, allow {low:g} to {high:g} m, more than the {relief:.3g} m of "
+                    "relief and than they are wide: nothing can fail there; tolerance_m is in metres")
+    return said
+
+
 def check_regions(deviation: HeightMap, regions: Sequence[Region], *, false_alarm: float, least_inspected: float
                   ) -> tuple[list[RegionResult], float]:
     """Decide about every region; `least_inspected`: the least part of the pixels of those that do not say it.

@@ -12,9 +12,11 @@ from scipy.ndimage import gaussian_filter
 from service.boards.findings import find_defects
 from service.boards.stitching.form import fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
+from service.boards.stitching.regions import too_wide
 from service.boards.stitching.significance import compare, scan_windows
 from service.boards.tiles import without_spikes
 from stage.formats import exr
+from stage.sets.board import Region
 from tests.marks import first_short
 from tests.scenes.board import PIXEL, SIGMA, domes, scan, write_scan
 from tests.scenes.captures import write_exr
@@ -301,3 +303,16 @@ def test_outliers_side_by_side_are_none_and_lines_and_squares_stay():
     groups[60, 70:73] = groups[10:12, 100] = groups[100:102, 90:92] = True
     assert np.nanmax(np.abs(image[groups])) < 5 * NOISE and np.nanmin(wide[groups]) > 8 * NOISE
     assert image[30:33, 40:43].min() > 15 * NOISE and image[80, 22:58].min() > 15 * NOISE
+
+
+@pytest.mark.parametrize(("tolerance", "elsewhere", "words"), [
+    (2e-5, 0.0, None), (2e-2, 0.0, "regions: 1, as U1, allow -0.02 to 0.02 m"), (20.0, 0.0, "allow -20 to 20 m"),
+    (2e-5, 5e-5, None), (2e-5, 0.05, "--tolerance-m allows 0.05 m")])
+def test_limits_in_another_unit_are_said(tolerance, elsewhere, words):
+    """A board with 100 µm of relief and a region of 1 mm; micrometres and millimetres in place of metres let anything pass."""
+    height = np.zeros((GRID.rows, GRID.cols))
+    height[ROWS, COLS] = 1e-4
+    nominal = HeightMap(GRID, height, np.zeros_like(height), np.zeros_like(height))
+    region = Region(name="U1", shape="rectangle", centre_m=(4e-3, 6e-3), size_m=(1e-3, 1e-3), tolerance_m=(-tolerance, tolerance))
+    said = too_wide(nominal, [region], elsewhere_m=elsewhere, smallest_m=2.4e-4)
+    assert said == [] if words is None else (len(said) == 1 and words in said[0])
