@@ -120,6 +120,12 @@ def _explains(left: float, misfit: float, times: float) -> bool:
     return left <= LARGEST_LEFT and misfit >= times * left
 
 
+def _apart(given: Fit) -> np.ndarray | None:
+    """Return the pixels [pixels] that face otherwise than most, which must agree with an explanation; None: they are too few."""
+    apart = given.apart
+    return apart if apart.sum() >= MIN_PIXELS else None
+
+
 def _angle(one: Fit, other: Fit) -> float:
     return float(np.median(degrees_between(one.normal, other.normal)))
 
@@ -183,8 +189,11 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
         step = median_of((readings / factor[:, None] / np.where(seen, model, 1)).T, seen.T)
         factor *= np.where(step > 0, step, 1.0)
         factor /= np.exp(np.log(factor).mean())
-    left = fit_lambertian(readings / factor[:, None], sample.usable, sample.directions).misfit()
+    free = fit_lambertian(readings / factor[:, None], sample.usable, sample.directions)
+    left = free.misfit()
     if np.log(factor).std() < LEAST_SPREAD or not _explains(left, misfit, TIMES_FREE):
+        return None
+    if (apart := _apart(given)) is not None and not _explains(free.misfit(apart), given.misfit(apart), TIMES_FREE):
         return None
     # the alternation stops half-way: enough to see that brightness explains the images, but not how far the normals are off
     try:
@@ -226,10 +235,16 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
         residual = np.where(lit, readings - lights @ surface, 0)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
         weight = lit / (1 + (residual / (3 * spread)) ** 2)
-    free = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit])))
-    scaled = np.abs(given.residual) * np.linalg.norm(given.vector, axis=0) / top
-    misfit = MAD_TO_SIGMA * float(np.median(scaled[lit]))
+    scaled = given.residual * np.linalg.norm(given.vector, axis=0) / top
+
+    def misfits(chosen: np.ndarray) -> tuple[float, float]:
+        free, declared = (MAD_TO_SIGMA * float(np.median(np.abs(each[chosen]))) if chosen.any() else np.nan for each in (residual, scaled))
+        return free, declared
+
+    free, misfit = misfits(lit)
     if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
+        return None
+    if (apart := _apart(given)) is not None and not _explains(*misfits(lit & apart), TIMES_FREE):
         return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))

@@ -30,6 +30,8 @@ LEAST_TOWARDS = 0.4
 most pixels."""
 LEAST_PIXELS = 20
 """Least number of these pixels that must see a light for it to be judged."""
+ALIKE, APART = np.cos(np.radians(10)), np.cos(np.radians(15))
+"""Cosines of the angles within which normals count as one, and beyond which they face otherwise."""
 SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
 """A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
 lights."""
@@ -57,9 +59,17 @@ class Fit(NamedTuple):
         """Return whether each pixel has more readings than unknowns, [pixels] bool."""
         return np.asarray(self.lit.sum(axis=0) > 2 + SPARE)
 
-    def misfit(self) -> float:
-        """Return the robust standard deviation of the residuals of pixels with readings to spare; NaN without any."""
-        chosen = self.lit & self.spare
+    @property
+    def apart(self) -> np.ndarray:
+        """Return whether each pixel faces otherwise than most, [pixels] bool. Highlights of a plane look like other lights to all of its
+        pixels: only those that face otherwise tell."""
+        normal = self.normal
+        commonest = normal[:, (normal.T @ normal > ALIKE).sum(axis=0).argmax()]
+        return np.asarray(commonest @ normal < APART)
+
+    def misfit(self, pixels: np.ndarray | bool = True) -> float:
+        """Return the robust standard deviation of the residuals of pixels [pixels] with readings to spare; NaN without any."""
+        chosen = self.lit & self.spare & pixels
         return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
 
 

@@ -35,6 +35,9 @@ LEAST_LIGHTS = 8
 LEAST_GAIN = 0.4
 """Least part of the cost of left-out pixels that other intensities must take away: where the declared ones are right, up to 0.3 goes on
 real objects, which are not quite Lambertian; errors of 5 % take away 0.5 to 0.8, and 0.26 on a glossy object."""
+LEAST_APART, LEAST_GAIN_APART = 20, 0.2
+"""Number of pixels that face otherwise than most (`Fit.apart`) from which on they must agree, and the least part of their cost that goes:
+of balls before glossy planes with right lights, none goes, while .4 to .8 of the cost of all pixels does."""
 LARGEST_LEFT = 0.05
 """Largest misfit that other intensities may leave, relative to |b|: bare metal leaves more under any intensities."""
 LARGEST_FALL = 0.1
@@ -77,6 +80,8 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     # of no change, of all that half the pixels ask for, and of what they can tell
     cost = np.zeros((3, len(pixels)))
     gain = 0.0
+    declared = fit_lambertian(readings, usable, lights.direction)
+    apart = declared.apart
     try:
         for fitted in (half, ~half):
             free, told = _factors(readings[:, fitted], usable[:, fitted], lights.direction, TRIAL_ROUNDS)
@@ -88,15 +93,16 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
             less = np.bincount(square, weights=cost[0] - cost[1 + chosen])
             if gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
                 return _declared(lights, "others explain left-out pixels hardly better", gain)
+            if apart.sum() >= LEAST_APART and cost[1 + chosen, apart].sum() > (1 - LEAST_GAIN_APART) * cost[0, apart].sum():
+                return _declared(lights, "others do not explain what faces otherwise than most of the object", gain)
         factor = _factors(readings, usable, lights.direction, ROUNDS)[chosen]
     except CalibrationError as error:
         return _declared(lights, str(error))
-    before, after = (fit_lambertian(readings / values[:, None], usable, lights.direction).misfit()
-                     for values in (np.ones_like(factor), factor))
+    after = fit_lambertian(readings / factor[:, None], usable, lights.direction).misfit()
     if not after <= LARGEST_LEFT:
         return _declared(lights, "no intensities explain the images by diffuse reflection", gain)
-    facts = {"used": "estimated", "left_out_gain": round(gain, 4), "misfit_declared": round(before, 4), "misfit_estimated": round(after, 4),
-             "spread": round(float(np.log(factor).std()), 4), "factors": factor.round(4).tolist()}
+    facts = {"used": "estimated", "left_out_gain": round(gain, 4), "misfit_declared": round(declared.misfit(), 4),
+             "misfit_estimated": round(after, 4), "spread": round(float(np.log(factor).std()), 4), "factors": factor.round(4).tolist()}
     return ChosenIntensities(lights._replace(irradiance=lights.irradiance * factor[:, None]), {"light_intensities": facts})
 
 

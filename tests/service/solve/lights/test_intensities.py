@@ -115,3 +115,30 @@ def test_few_lights_keep_the_declared_intensities(tmp_path):
     """Seven readings of a pixel fit almost any intensities."""
     _, report = solved(tmp_path, np.ones(7), "robust")
     assert report["found"]["light_intensities"] == {"used": "declared", "why": "fewer than 8 lights"}
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_path, wrong):
+    """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were 8°
+    off, and sure."""
+    count, side = 12, 48
+    directions, random = cap(count, 47.0), np.random.default_rng(3)
+    y, x = np.mgrid[1:-1:side * 1j, -1:1:side * 1j]
+    ball = x**2 + y**2 < 0.5**2
+    z = np.sqrt(np.maximum(0.5**2 - x**2 - y**2, 0))
+    normal = np.where(ball[..., None], np.stack([x, y, z], axis=-1) / 0.5, np.array([np.sin(0.2), 0.0, np.cos(0.2)]))
+    half = directions + [0, 0, 1]
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    lobe = np.where(ball, 0, 0.5 * np.maximum(normal @ half.T, 0).transpose(2, 0, 1) ** 12)
+    shading = np.maximum(normal @ directions.T, 0).transpose(2, 0, 1)
+    factor = np.exp(random.normal(0, 0.3, count)) if wrong else np.ones(count)
+    images = (factor[:, None, None] * (random.uniform(0.3, 0.7, (side, side)) * shading + lobe))[..., None] * np.ones(3)
+    images *= 1 + random.normal(0, 0.002, images.shape)
+    captures.write_lit(tmp_path / "cap", images.astype(np.float32), [captures.distant(way, np.pi) for way in directions],
+                       camera={"projection": "orthographic", "resolution": [side, side]})
+    result = solve(SolveRequest(capture=tmp_path / "cap", out=tmp_path / "out", device="cpu", method="robust"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["found"]["light_intensities"]["used"] == ("estimated" if wrong else "declared")
+    error = np.degrees(np.arccos(np.clip((result.maps.normal * normal).sum(axis=-1), -1, 1)))[ball & result.maps.mask]
+    assert any("frames[].light.irradiance" in words for words in report["warnings"]) is wrong
+    assert wrong or np.median(error) < 0.2, np.median(error)
