@@ -4,18 +4,16 @@ frames of a depth camera, or folders with results of relit depth."""
 import os
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from service.requests.imports.scans import ScansImport, ScanUnit
 from service.scans.depth_frames import write_frames
-from service.scans.points.ply_points import read_ply_points
-from service.scans.points.point_files import read_point_scans
+from service.scans.file_scans import FileScan, read_file_scans
 from service.scans.points.rigid import nearest_rigid
-from service.scans.viewpoints import LEAST_POINTS, find_viewpoints
-from stage.errors import ManifestError, ResultError, storage
-from stage.formats.ply import PointCloud, write_ply
+from service.scans.viewpoints import find_viewpoints
+from stage.errors import ManifestError, storage
+from stage.formats.ply import write_ply
 from stage.importers.depth_frames import DEPTH, frame_layout, pose_of
 from stage.importers.guess import POINT_FILES, depth_results
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
@@ -24,8 +22,6 @@ from stage.results.maps import MAPS_FILE
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, Turntable, write_scan_set
 from stage.transforms import ROTATION_ROUNDING, off_rotation
 
-FAR_AWAY = 100.0
-"""Coordinates of more than so many times the size of a scan are counted from another origin."""
 LARGE_M, SMALL_M = 50.0, 0.001
 """A scan of a format that has no unit is asked about if it is larger or smaller, metres."""
 METRIC = (".e57", ".ptx", ".las", ".laz")
@@ -39,23 +35,6 @@ FOR_FRAMES = {"poses": "--poses", "intrinsics_px": "--intrinsics", "every": "--e
 """The options that point files, and the frames of a depth camera, take beside those of a turntable; results of relit depth take none."""
 COARSE = 1e-4
 """Steps between the numbers of a file, in sizes of the scan, that are said: finer ones are below the noise of scanners."""
-GREY = 128
-"""The colour of points without one, of 255."""
-
-
-class _Scan(NamedTuple):
-    name: str
-    path: str
-    points: np.ndarray  # [n, 3]
-    normals: np.ndarray | None
-    viewpoint: np.ndarray | None  # [3] as its file says it
-    pose: np.ndarray | None  # [4, 4] world from scan
-    converted: PointCloud | None = None
-    """What is written to `path`; None: it is a file of the source."""
-    units_m: tuple[float, float, float] | None = None
-    """Metres in one unit of x, y and z as its file says; None: it does not."""
-    step_m: float = 0.0
-    """Metres between the floats of 32 bits that hold the farthest points; 0: they are held by finer numbers, or counted from among them."""
 
 
 def import_scans(request: ScansImport) -> Imported:
@@ -88,7 +67,8 @@ def import_scans(request: ScansImport) -> Imported:
     _refuse_unused(request, "point files", FOR_POINTS)
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
-    scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
+    scans, moved = read_file_scans(source, [name for name in names if name in poses] or names, poses,
+                                   None if request.unit is None else UNITS_M[request.unit.value])
     if folder == source and any(scan.converted is not None for scan in scans):
         raise ManifestError(f"{source}: its points lie far from the origin, and are counted from among them: give another folder for the "
                             "scans")
@@ -127,7 +107,7 @@ def _unit(request: ScansImport) -> ScanUnit:
     return request.unit or ScanUnit.M
 
 
-def _units_said(request: ScansImport, scans: list[_Scan]) -> list[tuple[str, str]]:
+def _units_said(request: ScansImport, scans: list[FileScan]) -> list[tuple[str, str]]:
     """Return what is said about scans whose files say another unit than `_unit`."""
     said: dict[tuple[float, float, float], list[str]] = {}
     for scan in scans:
@@ -181,67 +161,7 @@ def _result_entries(request: ScansImport, names: list[str]) -> list[ScanEntry]:
             for name in names]
 
 
-def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) -> tuple[list[_Scan], np.ndarray | None]:
-    """Return the scans, of which those of other files than PLY are to be written, and the place in the files that becomes the origin, or
-    None.
-
-    Coordinates on a map are too large for floats of 32 bits: a PLY file with doubles is written anew. Of scans with poses the points are
-    counted from among them in the frame of the scan, where the scanner then does not stand, and the poses from among their places.
-    """
-    unit, moved, stems = UNITS_M[_unit(request).value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
-    found = []
-
-    def shift_of(points: np.ndarray, pose: np.ndarray | None) -> np.ndarray:
-        nonlocal moved
-        middle = np.rint(points.mean(axis=0)) if np.abs(points).max() > FAR_AWAY * np.ptp(points, axis=0).max() else None
-        if pose is not None:
-            return np.zeros(3) if middle is None else middle
-        moved = middle if moved is None else moved
-        return np.zeros(3) if moved is None else moved
-
-    for name in names:
-        stem = Path(name).stem
-        if name.lower().endswith(".ply"):
-            cloud = read_ply_points(request.source / name)
-            pose = poses.get(name)
-            _check_points(request.source / name, cloud.points)
-            doubles = bool((cloud.points != cloud.points.astype(np.float32)).any())
-            shift = shift_of(cloud.points, pose) if doubles else np.zeros(3)
-            pose = None if pose is None else _in_metres(pose, shift, unit)
-            points = (cloud.points - shift) * unit
-            converted = None if not shift.any() else PointCloud(
-                points.astype(np.float32), _grey(points) if cloud.colours is None else cloud.colours, cloud.normals,
-                sigma=None if cloud.sigma is None else cloud.sigma * unit, confidence=cloud.confidence)
-            found.append(_Scan(stem, name, points, cloud.normals, None, pose, converted,
-                               step_m=_step(cloud.points) * unit if converted is None else 0.0))
-            continue
-        parts = read_point_scans(request.source / name)
-        for number, part in enumerate(parts, start=1):
-            _check_points(request.source / name, part.points)
-            in_unit = part.points if request.unit is not None or part.units_m is None else part.points * part.units_m
-            shift = shift_of(in_unit, part.pose)
-            points = (in_unit - shift) * unit
-            unique = stem if len(parts) == 1 else f"{stem}-{number}"
-            while unique in stems:
-                unique += "-" + Path(name).suffix[1:].lower()
-            stems.add(unique)
-            pose = None if part.pose is None else _in_metres(part.pose, shift, unit)
-            place = None if part.viewpoint is None or (pose is not None and shift.any()) else (part.viewpoint - shift) * unit
-            colours = _grey(points) if part.colours is None else part.colours
-            converted = PointCloud(points.astype(np.float32), colours, part.normals)
-            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose, converted, part.units_m,
-                               _step(part.points) * unit if _floats(part.points) else 0.0))
-    places = np.array([scan.pose[:3, 3] for scan in found if scan.pose is not None]).reshape(-1, 3)
-    if moved is None and len(places) and np.abs(places).max() > FAR_AWAY * max(
-            np.ptp(places, axis=0).max(), *(np.ptp(scan.points, axis=0).max() for scan in found)):
-        moved = np.rint(places.mean(axis=0) / unit)
-    for scan in found:
-        if scan.pose is not None and moved is not None:
-            scan.pose[:3, 3] -= moved * unit
-    return found, moved
-
-
-def _in_one_frame(scans: list[_Scan]) -> bool:
+def _in_one_frame(scans: list[FileScan]) -> bool:
     """Return whether all poses are the identity, which programs write too for scans that they have moved into one frame, and the scans
     look seen from elsewhere than their origin, where their files put the scanner."""
     if len(scans) < 2 or any(scan.viewpoint is None or scan.pose is None or (scan.pose != np.eye(4)).any() for scan in scans):
@@ -250,38 +170,7 @@ def _in_one_frame(scans: list[_Scan]) -> bool:
     return found is not None and bool(found.any())
 
 
-def _step(points: np.ndarray) -> float:
-    """Return the distance between floats of 32 bits at the farthest of points [n, 3], in their unit."""
-    return float(np.spacing(np.float32(np.abs(points).max())))
-
-
-def _floats(points: np.ndarray) -> bool:
-    """Return whether points [n, 3] were floats of 32 bits, also if they were written with nine digits."""
-    near = points.astype(np.float32)
-    return bool((np.abs(points - near) <= 0.05 * np.spacing(np.abs(near))).all())
-
-
-def _grey(points: np.ndarray) -> np.ndarray:
-    return np.full(points.shape, GREY, np.uint8)
-
-
-def _check_points(path: Path, points: np.ndarray) -> None:
-    """Refuse points [n, 3] that span no surface."""
-    different, rest = 0, points
-    while len(rest) and different < LEAST_POINTS:
-        different, rest = different + 1, rest[(rest != rest[0]).any(axis=1)]
-    if different < LEAST_POINTS:
-        raise ResultError(f"{path}: holds {different} different point{'s' * (different != 1)}: a surface has {LEAST_POINTS} or more")
-
-
-def _in_metres(pose: np.ndarray, shift: np.ndarray, unit: float) -> np.ndarray:
-    """Return a pose [4, 4], whose translation is in a unit of so many metres, of points that are counted from a place [3] in that unit."""
-    found = pose.copy()
-    found[:3, 3] = unit * (pose[:3, 3] + nearest_rigid(pose)[:3, :3] @ shift)
-    return found
-
-
-def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric: bool) -> list[tuple[str, str]]:
+def _doubts(request: ScansImport, scans: list[FileScan], sizes: list[float], metric: bool) -> list[tuple[str, str]]:
     """Return what is asked about the sizes of scans, metres, and said about places that floats do not hold and rotations that are none;
     `metric`: the format says the unit, or is one of large places."""
     said = []
@@ -304,7 +193,7 @@ def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric
     return said
 
 
-def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str, str]]) -> list[tuple[float, ...] | None]:
+def _viewpoints(request: ScansImport, scans: list[FileScan], facts: list[tuple[str, str]]) -> list[tuple[float, ...] | None]:
     """Return where the scanner of each scan stood, metres in the frame of the scan, or None, and add what is said of it to the facts."""
     if request.viewpoint_m is not None:
         facts.append(("viewpoint", f"{','.join(f'{x:g}' for x in request.viewpoint_m)} m in the frame of each scan, as given"))

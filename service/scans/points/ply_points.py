@@ -65,7 +65,7 @@ def read_ply_points(path: Path) -> PlyPoints:
 
     colours = columns(COLOUR)
     if colours is not None and colours.dtype != np.uint8:
-        colours = eight_bits(colours)
+        colours = colour_bytes(colours)
     normals, sigma, confidence = columns(NORMAL), columns((SIGMA,)), columns((CONFIDENCE,))
     return PlyPoints(points[there], None if normals is None else normals.astype(np.float32), colours,
                      None if sigma is None else sigma[:, 0].astype(np.float64),
@@ -78,7 +78,7 @@ def vertices_of(path: Path) -> int:
         return _header(stream, path)[1][-1].entries
 
 
-def eight_bits(colours: np.ndarray) -> np.ndarray:
+def colour_bytes(colours: np.ndarray) -> np.ndarray:
     """Return colours [n, 3] of any type and scale as uint8."""
     return np.rint(np.clip(np.nan_to_num(colours) * (255 / _full_scale(colours)), 0, 255)).astype(np.uint8)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.scans.points.ply_points import eight_bits
+from service.scans.points.ply_points import colour_bytes
 from stage.errors import ResultError, storage
 from stage.formats.e57 import read_e57
 from stage.formats.las import read_las
@@ -138,7 +138,7 @@ def _e57(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
     """Yield the scans of an E57 file; a scanner with a pose stands in the origin of its points."""
     for points, colours, pose in read_e57(path):
         finite = np.isfinite(points).all(axis=1)
-        yield PointScan(points[finite], None if colours is None else eight_bits(colours[finite]),
+        yield PointScan(points[finite], None if colours is None else colour_bytes(colours[finite]),
                         viewpoint=None if pose is None else np.zeros(3), pose=pose)
 
 
