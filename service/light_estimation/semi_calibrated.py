@@ -55,6 +55,8 @@ BEHIND = 0.05
 MISLEADS = 1.5
 """Error of the brightness of a light over the part that light from elsewhere has of it: with it, of 120 objects in a lit room, or with
 bounced light, under 8 to 24 lights, errors are .2 of the uncertainty in the median, and 1.6 times it at most."""
+ALIKE = 3.5
+"""What one pattern may leave, over what a fit of normals leaves, of a plane: up to 2.8 of planes, 4.7 and more of relief of a degree."""
 TINY = 1e-200
 """A number below any reading, which avoids division by zero."""
 
@@ -95,10 +97,10 @@ def uncertainty_of(readings: np.ndarray, usable: np.ndarray, directions: np.ndar
     """Return the standard deviation of the brightness of lights, [lights, 3] relative to the value, 1 at most: of what parts of the object
     ask for, and of what light from elsewhere may add, as much to dim lights as to bright ones. The arguments are those of
     `fit_intensities`, its result, and that of `light_from_elsewhere`."""
-    return np.fmin(np.hypot(_part_uncertainty(readings, usable, directions, irradiance), MISLEADS * elsewhere / irradiance), 1.0)
+    return np.fmin(np.hypot(part_uncertainty(readings, usable, directions, irradiance), MISLEADS * elsewhere / irradiance), 1.0)
 
 
-def _part_uncertainty(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+def part_uncertainty(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
     """Return the standard deviation of the brightness of lights, [lights, 3] relative to the value, from what parts of the object ask for.
 
     A surface that is not quite Lambertian asks for wrong lights, and leaves next to no residual; where it faces the viewer it asks for
@@ -121,6 +123,16 @@ def _part_uncertainty(readings: np.ndarray, usable: np.ndarray, directions: np.n
     enough = np.isfinite(asked).sum(axis=0) >= LEAST_PARTS
     own = np.nanvar(np.where(enough, asked, 0), axis=0)  # of six values: half of it is that of all lights
     return np.where(enough, IN_COMMON * np.sqrt((own + own.mean(axis=0)) / 2), 1.0)
+
+
+def shades_alike(readings: np.ndarray, usable: np.ndarray, misfit: float) -> bool:
+    """Return whether readings [lights, pixels] are one pattern of lights times the albedo of each pixel, as far as a fit that leaves
+    `misfit`, relative to |b|, tells: all pixels of a plane shade alike, whatever the lights are, so that they do not tell these."""
+    level = np.maximum(np.where(usable, readings, 0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1), TINY)
+    relative = readings / level
+    pattern = np.maximum(median_of(relative.T, usable.T), TINY)
+    off = np.abs(relative / pattern[:, None] - 1)[usable]
+    return MAD_TO_SIGMA * float(np.median(off)) < ALIKE * misfit
 
 
 def light_from_elsewhere(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:

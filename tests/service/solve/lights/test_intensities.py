@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
@@ -117,28 +118,54 @@ def test_few_lights_keep_the_declared_intensities(tmp_path):
     assert report["found"]["light_intensities"] == {"used": "declared", "why": "fewer than 8 lights"}
 
 
-@pytest.mark.parametrize("wrong", [False, True])
-def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_path, wrong):
-    """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were 8°
-    off, and sure."""
-    count, side = 12, 48
-    directions, random = cap(count, 47.0), np.random.default_rng(3)
-    y, x = np.mgrid[1:-1:side * 1j, -1:1:side * 1j]
-    ball = x**2 + y**2 < 0.5**2
-    z = np.sqrt(np.maximum(0.5**2 - x**2 - y**2, 0))
-    normal = np.where(ball[..., None], np.stack([x, y, z], axis=-1) / 0.5, np.array([np.sin(0.2), 0.0, np.cos(0.2)]))
-    half = directions + [0, 0, 1]
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    lobe = np.where(ball, 0, 0.5 * np.maximum(normal @ half.T, 0).transpose(2, 0, 1) ** 12)
+def solved_scene(folder, normal, lobe, factor, directions):
+    """Solve a surface of normals [rows, cols, 3] and a lobe [lights, rows, cols] under lights that are all declared alike and are stronger
+    by a factor each: errors of the normals over σ and in degrees, and the report."""
+    random, (rows, cols, _) = np.random.default_rng(3), normal.shape
     shading = np.maximum(normal @ directions.T, 0).transpose(2, 0, 1)
-    factor = np.exp(random.normal(0, 0.3, count)) if wrong else np.ones(count)
-    images = (factor[:, None, None] * (random.uniform(0.3, 0.7, (side, side)) * shading + lobe))[..., None] * np.ones(3)
-    images *= 1 + random.normal(0, 0.002, images.shape)
-    captures.write_lit(tmp_path / "cap", images.astype(np.float32), [captures.distant(way, np.pi) for way in directions],
-                       camera={"projection": "orthographic", "resolution": [side, side]})
-    result = solve(SolveRequest(capture=tmp_path / "cap", out=tmp_path / "out", device="cpu", method="robust"))
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    images = factor[:, None, None] * (random.uniform(0.3, 0.7, (rows, cols)) * shading + lobe)
+    images = (images * (1 + random.normal(0, 0.002, images.shape)))[..., None] * np.ones(3)
+    captures.write_lit(folder, images.astype(np.float32), [captures.distant(way, np.pi) for way in directions],
+                       camera={"projection": "orthographic", "resolution": [cols, rows]})
+    maps = solve(SolveRequest(capture=folder, out=folder / "out", device="cpu", method="robust", max_sigma=180)).maps
+    error = np.degrees(np.arccos(np.clip((maps.normal * normal).sum(axis=-1), -1, 1)))[maps.mask]
+    return error / maps.sigma[maps.mask], error, json.loads((folder / "out" / "report.json").read_text())
+
+
+def highlight(normal, directions):
+    half = directions + [0, 0, 1]
+    return np.maximum(normal @ (half / np.linalg.norm(half, axis=1, keepdims=True)).T, 0).transpose(2, 0, 1) ** 12
+
+
+@pytest.mark.parametrize("wrong", [0, 0.3])
+def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_path, wrong):
+    """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were
+    8° off, and sure. Where lights are wrong beside it, that is said, and σ holds it."""
+    count, side = 12, 48
+    directions = cap(count, 47.0)
+    y, x = np.mgrid[1:-1:side * 1j, -1:1:side * 1j]
+    ball = (x**2 + y**2 < 0.5**2)[..., None]
+    z = np.sqrt(np.maximum(0.5**2 - x**2 - y**2, 0))
+    normal = np.where(ball, np.stack([x, y, z], axis=-1) / 0.5, np.array([np.sin(0.2), 0.0, np.cos(0.2)]))
+    lobe = np.where(ball[..., 0], 0, 0.5 * highlight(normal, directions))
+    factor = np.exp(np.random.default_rng(3).normal(0, wrong, count))
+    over_sigma, error, report = solved_scene(tmp_path / "cap", normal, lobe, factor, directions)
+    assert wrong or report["found"]["light_intensities"]["used"] == "declared"
+    assert any("frames[].light.irradiance" in words for words in report["warnings"]) is bool(wrong)
+    assert np.percentile(over_sigma, 99) < 5 and (wrong or np.percentile(error, 10) < 0.2), np.percentile(error, 10)  # 20 % is the ball
+
+
+@pytest.mark.parametrize(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
+@pytest.mark.parametrize("degrees", [1, 3, 5])
+def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_them(tmp_path, degrees, gloss, wrong):
+    """As of a varnished picture: its normals were 22 to 29° off, by up to 61 σ, under right lights."""
+    count, side = 12, 48
+    directions = cap(count, 50.0)
+    rough = gaussian_filter(np.random.default_rng(1).normal(size=(side, side)), 2)
+    down, across = np.array(np.gradient(rough)) * np.tan(np.radians(degrees)) / np.hypot(*np.gradient(rough)).std()
+    normal = np.stack([0.15 - across, down, np.ones_like(rough)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    factor = np.exp(np.random.default_rng(3).normal(0, wrong, count))
+    over_sigma, error, report = solved_scene(tmp_path / "cap", normal, gloss * highlight(normal, directions), factor, directions)
     assert report["found"]["light_intensities"]["used"] == ("estimated" if wrong else "declared")
-    error = np.degrees(np.arccos(np.clip((result.maps.normal * normal).sum(axis=-1), -1, 1)))[ball & result.maps.mask]
-    assert any("frames[].light.irradiance" in words for words in report["warnings"]) is wrong
-    assert wrong or np.median(error) < 0.2, np.median(error)
+    assert np.percentile(over_sigma, 99) < 5 and (gloss or np.median(error) < 0.3), np.median(error)
