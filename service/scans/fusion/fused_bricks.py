@@ -21,8 +21,8 @@ from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
 from service.scans.fusion.common_scale import LEAST_SCANS, common_scale
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
-from service.scans.fusion.inverted_poses import agreement, inverted_fit
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, place_scans, reach_of, readings_of
+from service.scans.fusion.other_readings import meant_otherwise
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma
@@ -105,11 +105,9 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     readings = read("compare", samples, lambda _, scan: scan)
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
     warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
-    words, poses, given = None, scans.poses(), agreement(samples, readings)
-    if poses is not None and (found := inverted_fit(given, samples, poses, lambda moved, inverted: read("inverted", moved, inverted.scan))):
-        words = (f"scans[].scan_to_world: the poses are world_to_scan: {given.agreeing} points of scans lie on other scans and "
-                 f"{given.common - given.agreeing} beside them as they are, and {found.agreeing} and {found.common - found.agreeing} if "
-                 "each pose is inverted, as it must be")
+    words, poses = None, scans.poses()
+    if poses is not None and (meant := meant_otherwise(samples, readings, poses, lambda at, moved: read("otherwise", at, moved.scan))):
+        words = f"scans[].scan_to_world: {meant}"
     elif (scale := _scale_that_fits(summaries, placings, readings, voxel)) is not None:
         words = (f"several scans lie beside the others, and all fit if their coordinates are multiplied by {scale:.4f}, or the "
                  f"translations of their poses by {1 / scale:.4f}: the unit or the calibration of one of the two is wrong")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.errors import RequestError
 from service.requests.register import FuseRequest, Misplaced
@@ -112,11 +113,30 @@ def test_inverted_poses_are_named_so(tmp_path, moved_m):
     """About a round body most of the surface fits all the same; with the world beside it nothing does."""
     file = arc(tmp_path, lambda pose: np.linalg.inv(pose + moved_m * np.outer(np.eye(4)[0], np.eye(4)[3])))
     request = FuseRequest(scan_set=file, out=tmp_path / "out", texture=False, device="cpu")
-    with pytest.raises(RequestError, match=r"scans\[\]\.scan_to_world: the poses are world_to_scan: .* if each pose is inverted"):
+    with pytest.raises(RequestError, match=r"scans\[\]\.scan_to_world: the poses are world_to_scan: .* write them as scan_to_world"):
         fuse(request)
     assert not request.out.exists()
     kept = fuse(request.model_copy(update={"misplaced": Misplaced.KEEP}))
     assert sum("the poses are world_to_scan" in warning for warning in kept.warnings) == 1
+
+
+@pytest.mark.parametrize(("written", "words"), [
+    (np.linalg.inv, "that were imported are world_to_camera"),
+    (lambda pose: with_quaternion(pose, np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)), "begin with w")])
+def test_poses_of_imported_frames_that_mean_something_else_are_named(tmp_path, written, words):
+    """Files of depth cameras have poses in the axes of OpenCV, y down and z forwards."""
+    axes = np.diag([1.0, -1, -1, 1])
+    request = FuseRequest(scan_set=arc(tmp_path, lambda pose: written(pose @ axes) @ axes), out=tmp_path / "out", texture=False,
+                          device="cpu")
+    with pytest.raises(RequestError, match=words):
+        fuse(request)
+
+
+def with_quaternion(pose, quaternion):
+    """A pose with another rotation, x y z w."""
+    other = pose.copy()
+    other[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return other
 
 
 def test_right_poses_are_not_inverted_ones(tmp_path):
