@@ -157,7 +157,8 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
             raise ResultError(f"{file}: has a sigma that is not a positive number: give --sigma-m")
         spread = sigma * unit_m
     else:
-        scatter = robust_scatter(local_planes(points.astype(np.float32), origin=points.mean(axis=0)))
+        near = points - points.mean(axis=0)  # coordinates on a map are too large for floats of 32 bits
+        scatter = robust_scatter(local_planes(near.astype(np.float32), origin=np.zeros(3)))
         if not np.isfinite(scatter):
             raise ResultError(f"{file}: its {len(points)} points are too few or too far apart to tell their σ: give --sigma-m")
         spread = np.full(len(points), scatter)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.scans.points.ply_points import read_ply_points
+from service.scans.points.ply_points import chosen, read_ply_points, returned
 from service.scans.points.point_files import read_point_scans
 from service.scans.points.rigid import nearest_rigid
 from service.scans.viewpoints import LEAST_POINTS
@@ -33,6 +33,8 @@ class FileScan(NamedTuple):
     """Metres in one unit of x, y and z as its file says; None: it does not."""
     step_m: float = 0.0
     """Metres between the floats of 32 bits that hold the farthest points; 0: they are held by finer numbers, or counted from among them."""
+    left_out: int = 0
+    """Points at 0 0 0, to which nothing came back."""
 
 
 def read_file_scans(folder: Path, names: list[str], poses: dict[str, np.ndarray], unit_m: float | None
@@ -60,7 +62,8 @@ def read_file_scans(folder: Path, names: list[str], poses: dict[str, np.ndarray]
     for name in names:
         stem = Path(name).stem
         if name.lower().endswith(".ply"):
-            cloud = read_ply_points(folder / name)
+            read = read_ply_points(folder / name)
+            cloud = chosen(read, returned(read.points))
             pose = poses.get(name)
             _check_points(folder / name, cloud.points)
             doubles = bool((cloud.points != cloud.points.astype(np.float32)).any())
@@ -71,10 +74,14 @@ def read_file_scans(folder: Path, names: list[str], poses: dict[str, np.ndarray]
                 points.astype(np.float32), _grey(points) if cloud.colours is None else cloud.colours, cloud.normals,
                 sigma=None if cloud.sigma is None else cloud.sigma * unit, confidence=cloud.confidence)
             found.append(FileScan(stem, name, points, cloud.normals, None, pose, converted,
-                                  step_m=_step(cloud.points) * unit if converted is None else 0.0))
+                                  step_m=_step(cloud.points) * unit if converted is None else 0.0,
+                                  left_out=len(read.points) - len(cloud.points)))
             continue
         parts = read_point_scans(folder / name)
-        for number, part in enumerate(parts, start=1):
+        for number, whole in enumerate(parts, start=1):
+            there = returned(whole.points)
+            part = whole._replace(points=whole.points[there], colours=None if whole.colours is None else whole.colours[there],
+                                  normals=None if whole.normals is None else whole.normals[there])
             _check_points(folder / name, part.points)
             in_unit = part.points if unit_m is not None or part.units_m is None else part.points * part.units_m
             shift = shift_of(in_unit, part.pose)
@@ -88,7 +95,7 @@ def read_file_scans(folder: Path, names: list[str], poses: dict[str, np.ndarray]
             colours = _grey(points) if part.colours is None else part.colours
             converted = PointCloud(points.astype(np.float32), colours, part.normals)
             found.append(FileScan(unique, f"{unique}.ply", points, part.normals, place, pose, converted, part.units_m,
-                                  _step(part.points) * unit if _floats(part.points) else 0.0))
+                                  _step(part.points) * unit if _floats(part.points) else 0.0, len(there) - len(part.points)))
     places = np.array([scan.pose[:3, 3] for scan in found if scan.pose is not None]).reshape(-1, 3)
     if moved is None and len(places) and np.abs(places).max() > FAR_AWAY * max(
             np.ptp(places, axis=0).max(), *(np.ptp(scan.points, axis=0).max() for scan in found)):

@@ -82,6 +82,8 @@ def import_scans(request: ScansImport) -> Imported:
     facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
              ("size", f"{max(sizes):.3g} m is the widest at --unit {_unit(request)}"),
              ("poses", "not known" if not placed else f"{placed} from {'their files' if table is None else table}")]
+    if left_out := sum(scan.left_out for scan in scans):
+        facts.append(("points", f"{left_out} at 0 0 0 are left out: devices write so where nothing came back"))
     if request.viewpoint_m is None and _in_one_frame(scans):
         scans = [scan._replace(viewpoint=None) for scan in scans]
         facts.append(("poses", "are all the identity, and the scans do not look seen from their origin: they are taken to lie in one "

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.scans.points.planes import local_planes, robust_scatter
-from service.scans.points.ply_points import PlyPoints, read_ply_points
+from service.scans.points.ply_points import PlyPoints, chosen, read_ply_points, returned
 from service.scans.points.rigid import nearest_rigid
 from service.scans.points.scan import Scan, Target
 from stage.capture.camera import Camera
@@ -134,14 +134,13 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
 
 
 def _kept(ply: PlyPoints, viewpoint: np.ndarray | None) -> PlyPoints:
-    """Return the points without those whose σ says that they are none, and those at the scanner [3], which are its way to say the same."""
+    """Return the points without those whose σ says that they are none, and those at the scanner [3] or several times at 0 0 0,
+    which are its way to say the same."""
     there = np.ones(len(ply.points), dtype=bool) if ply.sigma is None else np.isfinite(ply.sigma) & (ply.sigma > 0)
+    there &= returned(ply.points)
     if viewpoint is not None:
         there &= np.abs(ply.points - viewpoint).max(axis=1) > FLOAT_STEP * np.abs(viewpoint).max()
-    kept = ply.kept.copy()
-    kept[kept] = there
-    return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None and name != "kept"},
-                        kept=kept)
+    return chosen(ply, there)
 
 
 def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, where: str) -> _Sigma:

@@ -21,7 +21,8 @@ from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
 from service.scans.fusion.common_scale import LEAST_SCANS, common_scale
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
-from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
+from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, place_scans, reach_of, readings_of
+from service.scans.fusion.other_readings import meant_otherwise
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma
@@ -94,22 +95,30 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     timings.stage("compare", len(scans))
     samples = [summary.sample for summary in summaries]
     reach = reach_of(samples, voxel)
-    content = pieces.do("compare", numbers, lambda piece: scans.of(int(piece), lambda scan: packed(readings_of(
-        scan, int(piece), samples, reach, device=device)._asdict())), follows_from=(known, reach),
-        advance=timings.advance)
-    readings = [Readings(**unpacked(content(piece))) for piece in numbers]
+
+    def read(name: str, samples: list[Sample], moved: Callable[[int, PreparedScan], PreparedScan]) -> list[Readings]:
+        content = pieces.do(name, numbers, lambda piece: scans.of(int(piece), lambda scan: packed(readings_of(
+            moved(int(piece), scan), int(piece), samples, reach, device=device)._asdict())), follows_from=(known, reach),
+            advance=timings.advance)
+        return [Readings(**unpacked(content(piece))) for piece in numbers]
+
+    readings = read("compare", samples, lambda _, scan: scan)
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
     warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
-    if (scale := _scale_that_fits(summaries, placings, readings, voxel)) is not None:
+    words, poses = None, scans.poses()
+    if poses is not None and (meant := meant_otherwise(samples, readings, poses, lambda at, moved: read("otherwise", at, moved.scan))):
+        words = f"scans[].scan_to_world: {meant}"
+    elif (scale := _scale_that_fits(summaries, placings, readings, voxel)) is not None:
         words = (f"several scans lie beside the others, and all fit if their coordinates are multiplied by {scale:.4f}, or the "
                  f"translations of their poses by {1 / scale:.4f}: the unit or the calibration of one of the two is wrong")
+    if words is not None:
         if request.misplaced is Misplaced.LEAVE_OUT:
             raise RequestError(f"{file}: {words}; --misplaced keep fuses them as they are")
         warnings = [words]
     used = [number for number, placing in enumerate(placings) if not (placing.misplaced and request.misplaced is Misplaced.LEAVE_OUT)]
     if len(scans) > 1 and request.misplaced is Misplaced.LEAVE_OUT and all(placing.compared < LEAST_COMMON for placing in placings):
-        raise RequestError(f"{file}: scans[].scan_to_world: no two of the {len(scans)} scans have a surface in common: look whether the "
-                           "poses are world_to_scan, and that lengths are in metres; --misplaced keep fuses scans of several things")
+        raise RequestError(f"{file}: scans[].scan_to_world: no two of the {len(scans)} scans have a surface in common: look whether "
+                           "lengths are in metres and poses scan_to_world; --misplaced keep fuses scans of several things")
     if 2 * len(used) < len(scans) + any(placing.against for placing in placings) or not used:
         raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
 

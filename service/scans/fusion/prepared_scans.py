@@ -15,6 +15,7 @@ from service.errors import RequestError
 from service.scans.fusion.fused_surface import centre_of
 from service.scans.fusion.misplaced import Sample, sample_of
 from service.scans.fusion.range_images import SQUARE_VOXELS, PreparedScan, focal_of, prepare_scan, with_layers
+from service.scans.points.rigid import nearest_rigid
 from service.scans.points.scan import Scan
 from service.scans.read import FLOAT_STEP, read_scan
 from stage.capture.camera import Camera
@@ -96,6 +97,11 @@ class PreparedScans:
     def __len__(self) -> int:
         """Return the number of scans."""
         return len(self._scan_set.scans)
+
+    def poses(self) -> list[np.ndarray] | None:
+        """Return world from scan [4, 4] of every scan as the scan set gives it, or None if it does not give all."""
+        given = [entry.scan_to_world for entry in self._scan_set.scans]
+        return None if None in given else [nearest_rigid(np.array(pose, dtype=np.float64)) for pose in given]
 
     def prepared(self, number: int) -> PreparedScan:
         """Return a scan with the layers that it has."""

@@ -72,6 +72,20 @@ def read_ply_points(path: Path) -> PlyPoints:
                      None if confidence is None else confidence[:, 0].astype(np.float32), there)
 
 
+def chosen(ply: PlyPoints, there: np.ndarray) -> PlyPoints:
+    """Return the points for which `there` [n] is True."""
+    kept = ply.kept.copy()
+    kept[kept] = there
+    return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None and name != "kept"},
+                        kept=kept)
+
+
+def returned(points: np.ndarray) -> np.ndarray:
+    """Return which of points [n, 3] are measured, [n] bool: several at exactly 0 0 0 are how devices write that nothing came back."""
+    there = np.asarray(points.any(axis=1))
+    return there if np.count_nonzero(~there) > 1 else np.ones(len(points), dtype=bool)
+
+
 def vertices_of(path: Path) -> int:
     """Return the number of vertices that the header of a PLY file names."""
     with storage("read", path), open(path, "rb") as stream:
@@ -153,6 +167,9 @@ def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], list[_El
     place = next((index for index, element in enumerate(elements) if element.name == "vertex"), None)
     if place is None or elements[place].entries == 0:
         raise ResultError(f"{path}: has no vertices")
+    names = [name for name, _ in elements[place].properties]
+    if twice := next((name for name in (*POSITION, *NORMAL, *COLOUR, SIGMA, CONFIDENCE, INVENTED) if names.count(name) > 1), None):
+        raise ResultError(f"{path}: its vertices have the property {twice} twice, and nothing tells which is meant: name one otherwise")
     if any(kind.startswith(LIST) for element in elements[:place + 1] for _, kind in element.properties):
         raise ResultError(f"{path}: has lists before the end of its vertices: write the vertices first, without lists")
     return order, elements[:place + 1], elements[place + 1:], behind

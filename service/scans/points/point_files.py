@@ -3,6 +3,7 @@
 import io
 import re
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -24,6 +25,9 @@ PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8", ("I", 1): "i1", ("I", 2): "<i2", 
 MOST_HEADER = 4096
 DECIMAL_COMMAS = re.compile(rb"NUMBER(?:[\s;]+NUMBER){2,}".replace(b"NUMBER", rb"[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?"))
 """A row of numbers some of which have decimal commas."""
+
+WORDS = re.compile(r"[^\s,;\"#/]+")
+"""Words of a heading, between blanks, commas, semicolons and quotes; CloudCompare begins it with two slashes."""
 
 
 class PointScan(NamedTuple):
@@ -48,8 +52,41 @@ def read_point_scans(path: Path) -> list[PointScan]:
 
 
 def _columns(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
-    """Yield the scan of rows of x, y, z, and of intensity, red, green and blue, or nx, ny and nz, where there are any."""
-    yield _scan(_table(_with_points(line for line in stream if line[:1] not in (b"#", b"/")), None, path))
+    """Yield the scan of rows of x, y, z, and of intensity, red, green and blue, or nx, ny and nz, where there are any; a heading, also
+    one that is a comment, says which is which."""
+    names: list[str] = []
+
+    def rows() -> Iterator[bytes]:
+        begun = False
+        for line in stream:
+            words = [] if begun else [word.partition("[")[0] for word in WORDS.findall(line.decode("utf-8-sig", "replace").lower())]
+            remark = line[:1] in (b"#", b"/")
+            if words[:3] == ["x", "y", "z"] or (not remark and {"x", "y", "z"} <= set(words)):
+                names[:] = words
+            elif not remark:
+                yield line if begun else line.removeprefix(BOM_UTF8)
+            begun = begun or bool(words and not remark)
+
+    table = _table(_with_points(rows()), None, path)
+    if not names or len(names) == table.shape[1]:
+        yield _named(table, names) if names else _scan(table)
+    elif names[:3] == ["x", "y", "z"]:
+        yield _scan(table)
+    else:
+        raise ResultError(f"{path}: has {len(names)} columns in its heading ({' '.join(names)}) and {table.shape[1]} numbers in its rows")
+
+
+def _named(table: np.ndarray, names: list[str]) -> PointScan:
+    """Return the scan of a table whose columns have names."""
+    def columns(*wanted: str) -> np.ndarray | None:
+        return table[:, [names.index(name) for name in wanted]] if set(wanted) <= set(names) else None
+
+    points, colours, normals = columns("x", "y", "z"), columns("r", "g", "b"), columns("nx", "ny", "nz")
+    colours = columns("red", "green", "blue") if colours is None else colours
+    assert points is not None
+    finite = np.isfinite(points).all(axis=1)
+    return PointScan(points[finite], None if colours is None else colour_bytes(colours[finite]),
+                     None if normals is None else normals[finite].astype(np.float32))
 
 
 def _with_points(lines: Iterator[bytes]) -> Iterator[bytes]:
@@ -161,12 +198,19 @@ def _count(stream: io.BufferedReader, path: Path) -> int | None:
 
 def _table(lines: Iterator[bytes] | io.BufferedReader, rows: int | None, path: Path) -> np.ndarray:
     """Return rows of numbers [rows, 3 or more] float64."""
+    last = [b""]
+
+    def noted(line: bytes) -> bytes:
+        last[0] = line
+        return line
+
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # which is said below
-            table = np.loadtxt(lines, dtype=np.float64, max_rows=rows, ndmin=2, comments=None)
+            table = np.loadtxt(map(noted, lines), dtype=np.float64, max_rows=rows, ndmin=2, comments=None)
     except (ValueError, UnicodeDecodeError) as error:
-        raise ResultError(f"{path}: its points are not rows of as many numbers each") from error
+        words = last[0][:40].decode("ascii", "replace").strip()
+        raise ResultError(f"{path}: must have rows of as many numbers each where it has {words!r}") from error
     if rows is not None and (len(table) != rows or not table.size):
         raise ResultError(f"{path}: is truncated: it holds {len(table)} of {rows} points")
     if table.size and table.shape[1] < 3:
@@ -175,13 +219,15 @@ def _table(lines: Iterator[bytes] | io.BufferedReader, rows: int | None, path: P
 
 
 def _scan(table: np.ndarray) -> PointScan:
-    """Return the scan of a table: x, y, z, then intensity where there are four or seven columns, then colours or normals."""
+    """Return the scan of a table: x, y, z, then intensity where there are four or seven columns, then colours or normals; a seventh column
+    of 255 alone is opacity behind colours."""
     table = table[np.isfinite(table[:, :3]).all(axis=1)]
-    rest = table[:, 4 if table.shape[1] in (4, 7) else 3:][:, :3]
+    opaque = table.shape[1] == 7 and len(table) > 0 and (table[:, 6] == 255).all()
+    rest = table[:, 4 if table.shape[1] in (4, 7) and not opaque else 3:][:, :3]
     if rest.shape[1] < 3 or not len(rest):
         return PointScan(table[:, :3])
     if np.abs(np.linalg.norm(rest, axis=1) - 1).max() < UNIT_LENGTH:
         return PointScan(table[:, :3], normals=rest.astype(np.float32))
-    if rest.min() >= 0 and rest.max() <= 255 and (rest == np.rint(rest)).all():
-        return PointScan(table[:, :3], colours=rest.astype(np.uint8))
+    if rest.min() >= 0 and (rest.max() <= 1 or (rest.max() <= 255 and (rest == np.rint(rest)).all())):
+        return PointScan(table[:, :3], colours=colour_bytes(rest))
     return PointScan(table[:, :3])

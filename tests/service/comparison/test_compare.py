@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.comparison.compare import compare
+from service.comparison.surfaces import read_scanned
 from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
@@ -322,3 +323,18 @@ def test_what_a_datum_leaves_open_keeps_the_σ_of_the_rest(tmp_path, part):
                   for more in ({}, {"regions": regions(tmp_path, given)}))
     assert np.diag(held)[3:5] == pytest.approx(np.diag(free)[3:5], rel=0.5)  # about another pivot
     assert held[5, 5] > free[5, 5]
+
+
+def test_sigma_is_estimated_on_a_map_as_near_the_origin(tmp_path):
+    """Floats of 32 bits hold coordinates of 5 000 km to half a metre."""
+    across = np.stack(np.meshgrid(np.linspace(0, 1, 40), np.linspace(0, 1, 40)), axis=-1).reshape(-1, 2)
+    points = np.column_stack([across, 1e-3 * np.random.default_rng(0).standard_normal(len(across))])
+    found = []
+    for number, place in enumerate(([0.0, 0, 0], [456789.0, 5432198, 312])):
+        path = tmp_path / f"{number}.ply"
+        head = "ply\nformat binary_little_endian 1.0\nelement vertex 1600\n" + "".join(f"property double {axis}\n" for axis in (
+            "x", "y", "z", "nx", "ny", "nz")) + "end_header\n"
+        path.write_bytes(head.encode() + np.hstack([points + place, np.tile([0.0, 0, 1], (1600, 1))]).astype("<f8").tobytes())
+        found.append(float(read_scanned(path, 1.0, None).sigma[0]))
+    assert found[0] == pytest.approx(1e-3, rel=0.1)  # the scatter of 1600 points around local planes
+    assert found[1] == pytest.approx(found[0], rel=0.05)  # nanometres move points on the borders of cells, by which planes are fitted

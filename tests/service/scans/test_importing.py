@@ -231,6 +231,11 @@ def pcd(points: np.ndarray, data: str, viewpoint: str) -> bytes:
     ("a.xyz", "#x, y, z\n" + rows(CORNER).replace(".", ","), False),
     ("a.asc", rows(CORNER, COLOURS).replace(".", ",").replace(" ", "; "), True),
     ("a.xyz", rows(CORNER).replace(" ", ", "), False),
+    ("a.xyz", "x y z\n" + rows(CORNER), False), ("a.xyz", "\ufeff" + rows(CORNER), False),
+    ("a.xyz", '"X[m]","Y[m]","Z[m]","Intensity","R","G","B"\n' + rows(CORNER, np.full(5, 7), COLOURS).replace(" ", ","), True),
+    ("a.asc", "//X Y Z R G B Label Nx Ny Nz\n" + rows(CORNER, COLOURS, np.full(5, 7), np.eye(3)[[0, 1, 2, 0, 1]]), True),
+    ("a.xyz", "# number X Y Z\nid x y z\n" + rows(np.arange(5), CORNER), False),
+    ("a.xyz", rows(CORNER, COLOURS, np.full(5, 255)), True), ("a.xyz", rows(CORNER, np.full(5, 300), COLOURS / 255), True),
     ("a.xyz", rows(CORNER, np.full(5, 7), COLOURS), True), ("a.pts", "5\n" + rows(CORNER, np.full(5, -900), COLOURS), True),
     ("a.pcd", pcd(CORNER, "ascii", "0 0 0"), True), ("a.pcd", pcd(CORNER, "binary", "0 0 0"), True)])
 def test_points_of_other_programs_become_scans(relit, tmp_path, name, content, coloured):
@@ -322,7 +327,9 @@ def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "content", "named"), [
-    ("a.xyz", b"1 2\n3 4\n", "x, y and z"), ("a.xyz", b"1 2 3\n4 5\n", "rows of as many"), ("a.xyz", b"", "without points"),
+    ("a.xyz", b"1 2\n3 4\n", "x, y and z"), ("a.xyz", b"1 2 3\n4 5\n", "as many numbers each where it has '4 5'"),
+    ("a.xyz", b"east north up\n1 2 3\n", "'east north up'"), ("a.xyz", b"id x y z\n1 2 3\n", "4 columns in its heading (id x y z) and 3"),
+    ("a.xyz", b"", "without points"),
     ("a.pts", b"3\n1 2 3\n", "1 of 3"), ("a.pts", b"x y\n1 2 3\n", "whole number"), ("a.ptx", b"1\n1\n0 0 0\n", "header"),
     ("a.ptx", ptx(CORNER, np.diag([2.0, 2, 2, 1])).encode(), "no rotation"),
     ("a.ptx", ptx(CORNER, POSE).rsplit("\n", 2)[0].encode(), "truncated"),

@@ -1,4 +1,4 @@
-"""Points of LAS and E57 files as other programs mark and colour them."""
+"""Points as other programs mark and colour them, and those that they write where nothing was measured."""
 
 import laspy
 import numpy as np
@@ -7,8 +7,10 @@ import pytest
 from pye57 import libe57
 
 from service.scans.points.point_files import read_point_scans
+from service.scans.read import read_scan
 from stage.errors import ResultError
-from stage.formats.ply import read_ply
+from stage.formats.ply import PointCloud, read_ply, write_ply
+from stage.sets.scan_set import read_scan_set
 
 POINTS = np.random.default_rng(0).random((20, 3))
 COLOURS = np.arange(60, dtype=np.uint8).reshape(20, 3) * 4
@@ -107,3 +109,23 @@ def test_las_files_in_feet_become_metres(relit, tmp_path, record, units):
     assert ("as the files say" in said) == (units != [1] * 3)
     said = relit.done("import", "scans", tmp_path / "in", tmp_path / "given", "--unit", "cm").out
     np.testing.assert_allclose(read_ply(tmp_path / "given" / "a.ply").points, POINTS * 0.01, atol=1e-8)  # the given unit holds
+
+
+@pytest.mark.parametrize("ending", ["ply", "xyz", "e57"])
+def test_where_nothing_came_back_is_no_surface(relit, tmp_path, ending):
+    """Devices write 0 0 0 there; the scan is a plate before the scanner, which stands at the origin of the file."""
+    across = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.2, 0.2, 40), [-1.0]), axis=-1).reshape(-1, 3)
+    points = np.concatenate([across, np.zeros((700, 3))]).astype(np.float32)
+    folder = tmp_path / "points"
+    folder.mkdir()
+    if ending == "ply":
+        write_ply(PointCloud(points, np.zeros(points.shape, np.uint8)), folder / "a.ply")
+    elif ending == "xyz":
+        np.savetxt(folder / "a.xyz", points)
+    else:
+        with pye57.E57(str(folder / "a.e57"), mode="w") as file:
+            file.write_scan_raw({f"cartesian{axis}": points[:, number].astype(float) for number, axis in enumerate("XYZ")})
+    said = relit.done("import", "scans", folder, tmp_path / "set").out
+    assert "1600 to 1600 points" in said and "0.4 m is the widest" in said and "700 at 0 0 0 are left out" in said
+    scan = read_scan(*read_scan_set(tmp_path / "set"), 0)
+    assert scan.points == pytest.approx(across, abs=1e-6)  # float32

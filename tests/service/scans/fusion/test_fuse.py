@@ -145,7 +145,10 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     inverted = write_scans(tmp_path, around, poses=[np.linalg.inv(shot.world_from_camera) for shot in around])
     on_map = write_scans(tmp_path / "map", shots[:2], poses=[shot.world_from_camera + ON_MAP for shot in shots[:2]])
     refused("scans lie 5.2e[+]06 m from the origin, where the floats of a mesh hold places to 0.5 m only: subtract one", scan_set=on_map)
-    refused(f"no two of the {len(around)} scans have a surface in common: look whether the poses are world_to_scan", scan_set=inverted)
+    refused("the poses are world_to_scan: read so, .* and 0 and 0 as they are: write them as scan_to_world", scan_set=inverted)
+    apart = [shot.world_from_camera + 9 * number * np.outer(np.eye(4)[0], np.eye(4)[3]) for number, shot in enumerate(around)]
+    refused(f"no two of the {len(around)} scans have a surface in common: look whether lengths are in metres",
+            scan_set=write_scans(tmp_path, around, poses=apart))
     assert not (tmp_path / "out").exists()
 
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.errors import RequestError
-from service.requests.register import FuseRequest
+from service.requests.register import FuseRequest, Misplaced
 from service.scans.fusion.fuse import fuse
 from service.scans.fusion.misplaced import Readings, Sample, place_scans
-from tests.scenes.statue import turntable, write_scans
+from tests.scenes.statue import place, shoot, turntable, write_scans
 
 VOXEL, SIGMA = 0.025, 0.5e-3
 POINTS, AGREEING = 1000, 0.8
@@ -98,3 +99,46 @@ def test_scans_of_another_scale_than_their_poses_are_named_so(tmp_path):
     # the factor by which depths were multiplied: at the fourth digit the fit is off, as it moves no point to another pixel
     with pytest.raises(RequestError, match=r"all fit if their coordinates are multiplied by 0\.990\d, .* by 1\.0\d+: the unit"):
         fuse(request)
+
+
+def arc(folder, poses=None):
+    """Three scans of the statue, 20 degrees apart, in the world frame of the first."""
+    shots = [shoot(place(np.radians(angle), 0.1, 2.0), (80, 60), 130.0, seed=angle) for angle in (0, 20, 40)]
+    first = np.linalg.inv(shots[0].world_from_camera)
+    return write_scans(folder, shots, poses=[poses(first @ shot.world_from_camera) for shot in shots])
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 1.0])
+def test_inverted_poses_are_named_so(tmp_path, moved_m):
+    """About a round body most of the surface fits all the same; with the world beside it nothing does."""
+    file = arc(tmp_path, lambda pose: np.linalg.inv(pose + moved_m * np.outer(np.eye(4)[0], np.eye(4)[3])))
+    request = FuseRequest(scan_set=file, out=tmp_path / "out", texture=False, device="cpu")
+    with pytest.raises(RequestError, match=r"scans\[\]\.scan_to_world: the poses are world_to_scan: .* write them as scan_to_world"):
+        fuse(request)
+    assert not request.out.exists()
+    kept = fuse(request.model_copy(update={"misplaced": Misplaced.KEEP}))
+    assert sum("the poses are world_to_scan" in warning for warning in kept.warnings) == 1
+
+
+@pytest.mark.parametrize(("written", "words"), [
+    (np.linalg.inv, "that were imported are world_to_camera"),
+    (lambda pose: with_quaternion(pose, np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)), "begin with w")])
+def test_poses_of_imported_frames_that_mean_something_else_are_named(tmp_path, written, words):
+    """Files of depth cameras have poses in the axes of OpenCV, y down and z forwards."""
+    axes = np.diag([1.0, -1, -1, 1])
+    request = FuseRequest(scan_set=arc(tmp_path, lambda pose: written(pose @ axes) @ axes), out=tmp_path / "out", texture=False,
+                          device="cpu")
+    with pytest.raises(RequestError, match=words):
+        fuse(request)
+
+
+def with_quaternion(pose, quaternion):
+    """A pose with another rotation, x y z w."""
+    other = pose.copy()
+    other[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return other
+
+
+def test_right_poses_are_not_inverted_ones(tmp_path):
+    found = fuse(FuseRequest(scan_set=arc(tmp_path, lambda pose: pose), out=tmp_path / "out", texture=False, device="cpu"))
+    assert all(scan["fused"] for scan in found.facts["scans"]) and not any("world_to_scan" in warning for warning in found.warnings)

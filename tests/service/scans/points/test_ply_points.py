@@ -76,6 +76,7 @@ def test_colours_a_little_above_one_are_those_from_0_to_1(tmp_path):
     (lambda raw: raw.replace(b"element vertex 4", b"element vertex 0"), "has no vertices"),
     (lambda raw: raw.replace(b"property float t", b"property list uchar int t"), "lists before the end of its vertices"),
     (lambda raw: raw.replace(b"binary_little_endian", b"binary_pdp_endian"), "its format is binary_pdp_endian"),
+    (lambda raw: raw.replace(b"property float sigma", b"property float x"), "have the property x twice"),
     (lambda raw: raw.replace(b"property short quality", b"property quaternion quality"), "is not understood"),
 ])
 def test_damaged_files_are_refused_with_a_sentence(tmp_path, change, sentence):

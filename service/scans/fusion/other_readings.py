@@ -1,0 +1,95 @@
+"""Whether scans lie on each other far better if their poses are read otherwise, as files of other programs have them.
+
+About an axis of a round body inverted poses lay scans on each other over most of the surface; what differs, as an arm, is there twice."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.scans.fusion.misplaced import LEAST_COMMON, SAME_SIGMAS, Readings, Sample
+from service.scans.fusion.range_images import PreparedScan
+from stage.transforms import OPENCV_FROM_CAMERA
+
+DOUBTFUL = 0.02
+"""Part of the points in common that may contradict before poses are read otherwise: of right poses 1 % do, and up to 5 % where pixels are
+coarse; of inverted ones about a body that is not nearly the same all around its axis 2 to 22 %."""
+FAR_BETTER = 0.5
+"""Part of the contradicting points that may be left with poses that are read otherwise: where these are the right ones .01 to .44 are, and
+where the poses as given are, 2.3 times as many or more contradict."""
+OPENCV = np.eye(4)
+OPENCV[:3, :3] = OPENCV_FROM_CAMERA
+"""To the axes of OpenCV, in which the poses of imported frames are, and back."""
+
+
+class Agreement(NamedTuple):
+    """The points that scans have in common."""
+
+    common: int  # points of all samples that another scan has near by
+    agreeing: int  # those of them that lie on the surface of another scan within their σ
+
+    @property
+    def contradicting(self) -> float:
+        """Return the part of the points in common that agree with no other scan; 1 where there are next to none."""
+        return 1.0 if self.common < LEAST_COMMON else 1 - self.agreeing / self.common
+
+
+def agreement(samples: list[Sample], readings: list[Readings]) -> Agreement:
+    """Return how many points of the samples the readings of all scans, as `misplaced.readings_of` returns them, agree with."""
+    common, agreeing = (np.zeros(sum(len(sample.points) for sample in samples), dtype=bool) for _ in range(2))
+    for each in readings:
+        common[each.at] = True
+        agreeing[each.at[np.abs(each.distance) <= SAME_SIGMAS * each.expected]] = True
+    return Agreement(int(common.sum()), int(agreeing.sum()))
+
+
+def _w_first(pose: np.ndarray) -> np.ndarray:
+    """Return a pose of imported frames whose quaternion was read as x y z w, and is w x y z."""
+    camera = pose @ OPENCV
+    camera[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(camera[:3, :3]).as_quat(), -1)).as_matrix()
+    return np.asarray(camera @ OPENCV)
+
+
+OTHERWISE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "the poses are world_to_scan": np.linalg.inv,
+    "the poses that were imported are world_to_camera": lambda pose: np.asarray(OPENCV @ np.linalg.inv(pose) @ OPENCV),
+    "the quaternions of the poses that were imported begin with w": _w_first,
+}
+"""How poses, world from scan [4, 4], may have been meant."""
+
+
+class Moved:
+    """Scans where they lie at other poses."""
+
+    def __init__(self, given: list[np.ndarray], others: list[np.ndarray]) -> None:
+        """Take the poses as given and the other ones, world from scan [4, 4]."""
+        self._back = [pose @ np.linalg.inv(other) for pose, other in zip(given, others, strict=True)]
+
+    def sample(self, number: int, sample: Sample) -> Sample:
+        """Return the points of the scan of a number."""
+        motion = np.linalg.inv(self._back[number])
+        return sample._replace(points=sample.points @ motion[:3, :3].T + motion[:3, 3], normals=sample.normals @ motion[:3, :3].T)
+
+    def scan(self, number: int, scan: PreparedScan) -> PreparedScan:
+        """Return the scan of a number."""
+        return scan._replace(image=scan.image._replace(camera_from_world=scan.image.camera_from_world @ self._back[number]))
+
+
+def meant_otherwise(samples: list[Sample], readings: list[Readings], poses: list[np.ndarray],
+                    read: Callable[[list[Sample], Moved], list[Readings]]) -> str | None:
+    """Return how the poses must be read for scans to lie on each other far better than as given, in words; None: there is no such way.
+
+    `readings`: of the poses as given. `poses`: world from scan [4, 4] of each. `read`: returns the readings of samples, with scans that
+    `Moved` moves."""
+    given = agreement(samples, readings)
+    if len(poses) < 2 or given.contradicting <= DOUBTFUL:
+        return None
+    for words, other in OTHERWISE.items():
+        moved = Moved(poses, [other(pose) for pose in poses])
+        there = [moved.sample(number, sample) for number, sample in enumerate(samples)]
+        found = agreement(there, read(there, moved))
+        if found.contradicting <= FAR_BETTER * given.contradicting and found.agreeing >= given.agreeing + LEAST_COMMON:
+            return (f"{words}: read so, {found.agreeing} points of scans lie on other scans and {found.common - found.agreeing} beside "
+                    f"them, and {given.agreeing} and {given.common - given.agreeing} as they are: write them as scan_to_world")
+    return None
