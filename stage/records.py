@@ -1,6 +1,7 @@
 """Reading of JSON files by a schema, with one sentence about each fault, which names the file and the field."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -18,6 +19,8 @@ MAX_KEYS = 1000
 """The most keys of a JSON object: no schema has as many, and an error is collected for each unknown key."""
 MOST_SHOWN = 60
 """The most characters of a value or a key that a sentence repeats."""
+IDENTIFIER = re.compile(r"\^(\w+_)\[")
+"""Finds the prefix in the pattern of identifiers that a program gives out, which nobody makes up."""
 
 
 def read_record(path: str | Path, model: type[Record], further: Callable[[dict[str, Any]], Iterator[str]] | None = None) -> Record:
@@ -99,6 +102,8 @@ def _said(fault: Any) -> str:
             return f"is {_short(fault['input'])}: must be an object"
         case "union_tag_not_found":
             return f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
+        case "string_pattern_mismatch" if prefix := IDENTIFIER.match(fault["ctx"]["pattern"]):
+            return f"is {_short(fault['input'])}: give an identifier as the service printed it, which begins with {prefix[1]}"
         case _:
             return f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
 
