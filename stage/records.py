@@ -27,11 +27,14 @@ def read_record(path: str | Path, model: type[Record], further: Callable[[dict[s
     """Read a JSON file and check it against a model, whose key `schema` it must have.
     `further`: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report because it
     stops at the first fault of a long list."""
+    schema = schema_of(model)
+    if Path(path).is_dir():
+        raise ManifestError(f"{path}: is a folder: give a JSON file with the schema {schema}")
     text = inputs.read_bytes(path)
     try:
         data = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except UnicodeDecodeError as error:
-        raise ManifestError(f"{path}: is not UTF-8 text") from error
+        raise ManifestError(f"{path}: is not UTF-8 text: this program reads JSON with the schema {schema}") from error
     except json.JSONDecodeError as error:
         raise ManifestError(f"{path}: is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
     except RecursionError as error:
@@ -40,7 +43,6 @@ def read_record(path: str | Path, model: type[Record], further: Callable[[dict[s
         raise ManifestError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
-    schema = schema_of(model)
     if "schema" not in data:
         raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
     if data["schema"] != schema:
