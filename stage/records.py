@@ -1,6 +1,7 @@
 """Reading of JSON files by a schema, with one sentence about each fault, which names the file and the field."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -18,17 +19,22 @@ MAX_KEYS = 1000
 """The most keys of a JSON object: no schema has as many, and an error is collected for each unknown key."""
 MOST_SHOWN = 60
 """The most characters of a value or a key that a sentence repeats."""
+IDENTIFIER = re.compile(r"\^(\w+_)\[")
+"""Finds the prefix in the pattern of identifiers that a program gives out, which nobody makes up."""
 
 
 def read_record(path: str | Path, model: type[Record], further: Callable[[dict[str, Any]], Iterator[str]] | None = None) -> Record:
     """Read a JSON file and check it against a model, whose key `schema` it must have.
     `further`: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report because it
     stops at the first fault of a long list."""
+    schema = schema_of(model)
+    if Path(path).is_dir():
+        raise ManifestError(f"{path}: is a folder: give a JSON file with the schema {schema}")
     text = inputs.read_bytes(path)
     try:
         data = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except UnicodeDecodeError as error:
-        raise ManifestError(f"{path}: is not UTF-8 text") from error
+        raise ManifestError(f"{path}: is not UTF-8 text: this program reads JSON with the schema {schema}") from error
     except json.JSONDecodeError as error:
         raise ManifestError(f"{path}: is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
     except RecursionError as error:
@@ -37,7 +43,6 @@ def read_record(path: str | Path, model: type[Record], further: Callable[[dict[s
         raise ManifestError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
-    schema = schema_of(model)
     if "schema" not in data:
         raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
     if data["schema"] != schema:
@@ -99,6 +104,8 @@ def _said(fault: Any) -> str:
             return f"is {_short(fault['input'])}: must be an object"
         case "union_tag_not_found":
             return f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
+        case "string_pattern_mismatch" if prefix := IDENTIFIER.match(fault["ctx"]["pattern"]):
+            return f"is {_short(fault['input'])}: give an identifier as the service printed it, which begins with {prefix[1]}"
         case _:
             return f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
 

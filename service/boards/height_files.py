@@ -15,7 +15,7 @@ from service.boards.stitching.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_
 from stage.errors import BoardError, ManifestError, ResultError
 from stage.formats import exr
 from stage.records import read_record
-from stage.results.result_metadata import camera_and_provenance, result_metadata
+from stage.results.result_metadata import camera_and_provenance, result_file, result_metadata
 from stage.sets.board import BoardDesign, BoardRegions, Region
 
 BOARD_FILE = "board.exr"
@@ -49,7 +49,7 @@ def read_golden(path: Path, regions: Path | None = None) -> Nominal:
     """Read the height map of a good board.
     `path`: a result folder of relit inspect-board, or its board.exr. `regions`: the JSON file of the regions that are judged on it; None:
     there are none."""
-    file = path / BOARD_FILE if path.is_dir() else path
+    file = result_file(path, BOARD_FILE, command="relit inspect-board")
     channels, metadata = exr.read(file)
     camera, _ = camera_and_provenance(metadata, file, file_name=BOARD_FILE)
     try:

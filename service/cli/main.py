@@ -127,7 +127,9 @@ def main() -> None:
         sys.exit(code)
     except TyperException as error:
         if text := " ".join(error.format_message().replace("Value error, ", "").split()):  # else the help has been shown
-            print(f"relit: {text[0].lower()}{text[1:].removesuffix('.')}: see relit --help", file=sys.stderr)
+            context = getattr(error, "ctx", None)
+            command = "relit" if context is None else context.command_path
+            print(f"relit: {text[0].lower()}{text[1:].removesuffix('.')}: see {command} --help", file=sys.stderr)
         sys.exit(error.exit_code)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output is gone

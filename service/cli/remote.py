@@ -32,7 +32,7 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
     from service.errors import RequestError
 
     try:
-        with Client(server, key) as client:
+        with Client(server, key, on_silence=lambda words: print(f"relit: {words}", file=sys.stderr)) as client:
             yield client
     except ClientError as error:
         raise RequestError(str(error)) from error

@@ -1,5 +1,6 @@
 """A client of the service for Python programs; docs/python_client.md explains its use."""
 
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -32,7 +33,8 @@ class Client:
     """Uploads captures, submits jobs and downloads their results; several threads may use one client."""
 
     def __init__(self, server: str = DEFAULT_SERVER, key: str | None = None, *, patience_s: float = 120.0, timeout_s: float = 60.0,
-                 parallel: int = 4, transport: httpx2.BaseTransport | None = None) -> None:
+                 parallel: int = 4, transport: httpx2.BaseTransport | None = None,
+                 on_silence: Callable[[str], None] | None = None) -> None:
         """Prepare the client; nothing is sent yet.
 
         Args:
@@ -43,8 +45,9 @@ class Client:
             timeout_s: how long to wait for a connection, or for the next bytes.
             parallel: number of files that are sent or fetched at once.
             transport: an httpx2 transport, for a proxy, a certificate authority or a socket; None: httpx2's default.
+            on_silence: told, once, with a sentence when the service first does not answer a request that is then repeated.
         """
-        self._connection = Connection(server, key, patience_s=patience_s, timeout_s=timeout_s, transport=transport)
+        self._connection = Connection(server, key, patience_s=patience_s, timeout_s=timeout_s, transport=transport, on_silence=on_silence)
         self.captures = Intakes(self._connection, "/v1/captures", "folder", parallel=parallel)
         self.environments = Intakes(self._connection, "/v1/environments", "file", parallel=parallel)
         self.annotations = Annotations(self._connection)

@@ -3,7 +3,7 @@
 import random
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -49,8 +49,8 @@ class Connection:
     """Sends requests to one service under one key; several threads may use one connection."""
 
     def __init__(self, server: str, key: str | None, *, patience_s: float, timeout_s: float,
-                 transport: httpx2.BaseTransport | None = None) -> None:
-        self.server, self._patience_s = server.rstrip("/").removesuffix("/v1"), patience_s
+                 transport: httpx2.BaseTransport | None = None, on_silence: Callable[[str], None] | None = None) -> None:
+        self.server, self._patience_s, self._on_silence = server.rstrip("/").removesuffix("/v1"), patience_s, on_silence
         if key is not None and not (key.isascii() and key.isprintable()):
             raise ClientError("the key has characters that no key has")
         try:
@@ -90,6 +90,9 @@ class Connection:
                 answer = self.http.request(method, path, **options)
             except httpx2.TransportError as error:
                 again = repeatable or isinstance(error, NOT_SENT)
+                if again and self._on_silence is not None:
+                    self._on_silence(f"{self.unreachable(error)}; asked again for {self._patience_s:.0f} s")
+                    self._on_silence = None
                 if not again or not backoff.wait():
                     raise self.unreachable(error, unknown=not again) from error
                 continue

@@ -118,7 +118,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         cloud = None
     else:
         refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
-        _check_plausible(solution, capture, using)
+        _check_plausible(solution, capture, request, using)
         _tell_shared_error(solution, capture, using)
         timings.stage("points", 1)
         cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
@@ -167,14 +167,20 @@ def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
     return found[0]
 
 
-def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
+def _check_plausible(solution: DepthSolution, capture: Capture, request: DepthRequest, using: Ranging) -> None:
     """Refuse a solution without any depth, or with depths that cannot be in metres; warn where every depth is unsure."""
     estimated = solution.estimated
     if not solution.solved.any():
         text = _reasons(solution)
         if not estimated.any():
+            counts = solution.counts(np.ones_like(estimated))
+            ranges_m = {"--near-m": request.near_m, "--far-m": request.far_m}
+            asked = " and ".join(f"{option} {range_m:g}" for option, range_m in ranges_m.items() if range_m is not None)
+            if asked and max(counts, key=lambda name: counts[name]) == Status.OUT_OF_RANGE.name.lower():
+                raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}) within {asked}: "
+                                    "give the metres between which the scene lies")
             raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): "
-                                f"{'; '.join(solution.warnings) or _advice(solution.counts(np.ones_like(estimated)), using)}")
+                                f"{'; '.join(solution.warnings) or _advice(counts, using)}")
         solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
                                  "--least-confidence 0 counts unsure ones as solved")
     middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths

@@ -92,7 +92,10 @@ def clipped_sentence(shares: Sequence[float], pixels: float, picture: str, known
 
 
 def dim_sentences(peak: float) -> list[str]:
-    """Return a sentence if the largest value of all frames, `peak`, is so small that half floats store them in coarse steps, else none."""
+    """Return a sentence if the largest value of all frames, `peak`, is 0, or so small that half floats store them in coarse steps, else
+    none."""
+    if peak == 0:
+        return ["every value of the frames is 0: no light that was asked for reaches what the camera sees"]
     if not 0 < peak < exr.HALF_NORMAL:
         return []
     return [f"the brightest value of the frames is {peak:.2g}: below {exr.HALF_NORMAL:.2g} half floats have steps of {exr.HALF_STEP:.2g}, "

@@ -13,6 +13,7 @@ from stage.colour.colour import rgb_matrix
 from stage.errors import ResultError
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from stage.results.matte import Matte, MatteSource, matte_of
+from stage.results.result_metadata import result_file
 from stage.stack.stack import Stack
 
 
@@ -85,11 +86,9 @@ def hard_matte(mask: np.ndarray) -> Matte:
 
 
 def maps_file(folder: Path, capture: Path, captures: int) -> Path:
-    """Return the file of a capture's maps, which must be there: in the folder, or for a sequence in its sub-folder of that name."""
-    path = (folder / capture.name if captures > 1 else folder) / MAPS_FILE
-    if not path.is_file():
-        raise RequestError(f"--maps {folder}: {path} is not there: run `relit solve` first")
-    return path
+    """Return the file of a capture's maps, which must be there: given as itself or by its folder, for a sequence in the sub-folder of the
+    capture's name."""
+    return result_file(folder / capture.name if captures > 1 else folder, MAPS_FILE, command="relit solve")
 
 
 def read_maps(path: Path, capture: Capture) -> SurfaceMaps:

@@ -14,6 +14,7 @@ from service.requests.base.option_values import (
     CornersText,
     LevelsText,
     MarkerSide,
+    PartOfLight,
     SquareSide,
     StepHeight,
     refuse,
@@ -67,7 +68,7 @@ class LightPositionsOptions(MirrorBallOptions):
 class GreyBallOptions(BallOptions):
     """Albedo, radius and distance of the grey ball."""
 
-    albedo: Annotated[tuple[Positive, Positive, Positive] | None, AlbedoText, Spelling(metavar="R,G,B")] = None
+    albedo: Annotated[tuple[Positive, Positive, Positive] | None, AlbedoText, PartOfLight, Spelling(metavar="R,G,B")] = None
     """Albedo of the ball, one number or three; None: only ratios of irradiance are measured, and their mean is set to 1."""
     refine_direction: bool = False
     """Take the direction of distant lights from the shading, in place of the manifest."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from service.requests.base.base import CAPTURE, Choice, Commas, CropBox, Options, Role, Spelling
-from service.requests.base.option_values import AlbedoText
+from service.requests.base.option_values import AlbedoText, PartOfLight
 from service.requests.calibrate import MirrorBallOptions
 from service.requests.drive import RIG
 from service.requests.light.picture_options import FrameRate
@@ -139,7 +139,7 @@ class RigCalibrationOptions(MirrorBallOptions):
     """Pixels of the centres of four patches of the chart: the first, the last of the first row, the last, and the first of the last row."""
     grid: Annotated[tuple[GridCount, GridCount], Commas, Spelling(metavar="COLUMNS,ROWS")] = (6, 4)
     """Columns and rows of the chart's patches."""
-    albedo: Annotated[tuple[Positive, Positive, Positive] | None, AlbedoText, Spelling(metavar="R,G,B")] = None
+    albedo: Annotated[tuple[Positive, Positive, Positive] | None, AlbedoText, PartOfLight, Spelling(metavar="R,G,B")] = None
     """Albedo of the ball or card, reflectance of the mirror, one number or three; None: the mean of all irradiances is set to 1."""
 
 

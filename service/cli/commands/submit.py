@@ -21,6 +21,7 @@ from service.cli.remote import (
     wait_for,
 )
 from service.cli.request_commands import Given, command
+from service.errors import RequestError
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import ALPHABET, CAPTURE, DEFAULT_SERVER, ENVIRONMENT, LENGTH, pattern
 from service.requests.base.options import Option, help_text, is_document, options_of
@@ -71,7 +72,12 @@ def _each(given: str | list[str], identify: Callable[[str], str]) -> str | tuple
 
 
 def _placeholder(prefix: str, given: str) -> str:
-    """Return an identifier in place of what was given, with which a request is refused before files are sent."""
+    """Return an identifier in place of what was given, with which a request is refused before files are sent.
+    Raises RequestError: a folder is given as an environment, or a file as a capture."""
+    if prefix == ENVIRONMENT and Path(given).is_dir():
+        raise RequestError(f"{given}: is a folder: an environment is one lat-long .exr or .hdr")
+    if prefix == CAPTURE and Path(given).is_file():
+        raise RequestError(f"{given}: is a file: give the folder of the capture")
     return f"{prefix}_{ALPHABET[0] * LENGTH}"
 
 

@@ -11,6 +11,7 @@ from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.patterns import PatternAxis, PatternCode, PatternsRequest, PlanRequest
 from stage.capture.manifest import Frame
+from stage.errors import storage
 from stage.files import replacing, write_text
 from stage.formats.images import write_png
 from stage.patterns import planner
@@ -32,7 +33,7 @@ class PatternsResult(NamedTuple):
 
 
 def make_patterns(request: PatternsRequest, progress: Progress | None = None) -> PatternsResult:
-    """Write PNG images and patterns.json.
+    """Write PNG images and patterns.json, in place of those of an earlier run.
     Raises RequestError: an option that does not belong to the code, or that the code refuses. Raises StorageError: a file cannot be
     written."""
     for option, codes in CODES_OF_OPTION.items():
@@ -54,6 +55,10 @@ def make_patterns(request: PatternsRequest, progress: Progress | None = None) ->
         timings.advance(index + 1)
     timings.close()
     fragment = request.out / FRAGMENT
+    if fragment.exists():  # of an earlier run, which may have had more images: whoever shows all of the folder would show them too
+        for path in set(request.out.glob("pattern_[0-9][0-9][0-9]*.png")) - set(images):
+            with storage("remove", path):
+                path.unlink()
     write_text(fragment, '{\n  "frames": [\n' + ",\n".join(f"    {json.dumps(frame)}" for frame in frames) + "\n  ]\n}\n")
     return PatternsResult(tuple(images), fragment)
 

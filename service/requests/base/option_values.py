@@ -55,6 +55,14 @@ def _albedo(given: Any) -> Any:
     return tuple(values * 3 if len(values) == 1 else values)
 
 
+def _part_of_the_light(given: tuple[float, ...] | None) -> tuple[float, ...] | None:
+    """Return an albedo, which is refused where it seems to be in percent."""
+    if given is not None and max(given) > 1:
+        refuse(f"--albedo {max(given):g}: nothing reflects more than all light: give a part of it, such as {max(given) / 100:g} for "
+               f"{max(given):g} %")
+    return given
+
+
 def _corners(given: Any) -> Any:
     """Return the inner corners of a chessboard, across and down, that a text such as 9x6 names."""
     if not isinstance(given, str):
@@ -81,6 +89,7 @@ def _levels(given: Any) -> Any:
 Corners = Annotated[int, Field(ge=3)]
 CircleText = BeforeValidator(_circle)
 AlbedoText = BeforeValidator(_albedo)
+PartOfLight = AfterValidator(_part_of_the_light)
 CornersText = BeforeValidator(_corners)
 LevelsText = BeforeValidator(_levels)
 SquareSide = AfterValidator(partial(_in_metres, option="--square-m", what="a square of a chessboard"))

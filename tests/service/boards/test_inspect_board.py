@@ -10,11 +10,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from service.boards.findings import find_defects
+from service.boards.height_files import read_golden
 from service.boards.stitching.form import fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import too_wide
 from service.boards.stitching.significance import compare, scan_windows
 from service.boards.tiles import without_spikes
+from stage.errors import ResultError
 from stage.formats import exr
 from stage.sets.board import Region
 from tests.marks import first_short
@@ -192,6 +194,11 @@ def test_a_bad_board_file_is_one_sentence(relit, tmp_path, change, words):
     outcome = relit("inspect-board", folder, "--out", tmp_path / "o", "--device", "cpu")
     assert outcome.code == 2 and words in outcome.err and outcome.err.count("\n") == 1, outcome.err
     assert "board.json" in outcome.err and not (tmp_path / "o").exists()
+
+
+def test_a_golden_that_was_not_inspected_is_named(tmp_path):
+    with pytest.raises(ResultError, match=r"board\.exr: is not there: run `relit inspect-board` first"):
+        read_golden(tmp_path)
 
 
 def test_tiles_without_sigma_and_designs_of_another_size_are_refused(relit, tmp_path):

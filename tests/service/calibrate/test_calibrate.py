@@ -303,6 +303,8 @@ BAD = {
     "mask of another size": (["mirror-ball", "--ball-mask", "small.png"], {}, "small.png: is 4x4, camera.resolution says 96x80"),
     "level": (["mirror-ball", *BALL, "--level", "1"], {}, "level: is 1.0: input should be less than 1"),
     "albedo": (["grey-ball", *BALL, "--albedo", "0.5,0.5"], {}, "--albedo 0.5,0.5: give one number or three"),
+    "albedo in percent": (["grey-ball", *BALL, "--albedo", "18"], {},
+                          "--albedo 18: nothing reflects more than all light: give a part of it, such as 0.18 for 18 %"),
     "radii": (["light-positions", *BALL, *BALL, *BALL, "--ball-radius-m", "0.1", "--ball-radius-m", "0.1"], {},
               "--ball-radius-m: is given 2 times for 3 balls"),
     "radius in millimetres": (["light-positions", *BALL, "--ball", "20,20,10", "--ball-radius-m", "30"], {},

@@ -87,11 +87,11 @@ def test_a_driver_that_is_too_old_for_the_gpu_is_said(relit, tmp_path, monkeypat
 @pytest.mark.parametrize(("arguments", "words"), [
     (["paint"], "no such command 'paint'"),
     (["solve"], "missing argument 'CAPTURE'"),
-    (["solve", "cap"], "missing option '--out'"),
+    (["solve", "cap"], "missing option '--out': see relit solve --help"),
     (["solve", "cap", "--out", "o", "--method", "magic"],
      "invalid value for '--method': 'magic' is not one of"),
     (["solve", "cap", "--colour"], "no such option: --colour"),
-    (["import", "zip", "a", "b"], "no such command 'zip'"),
+    (["import", "zip", "a", "b"], "no such command 'zip': see relit import --help"),
     (["bench", "--repeats", "1"], "repeats: is 1: input should be greater than or equal to 3"),
 ])
 def test_wrong_options_are_one_sentence(relit, arguments, words):

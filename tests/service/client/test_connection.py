@@ -2,6 +2,7 @@
 
 import json
 import socket
+from typing import Any
 
 import httpx2
 import pytest
@@ -47,7 +48,7 @@ def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return found
 
 
-def client(transport: httpx2.BaseTransport, **options: float) -> Client:
+def client(transport: httpx2.BaseTransport, **options: Any) -> Client:
     return Client("http://service.test", "a-key", transport=transport, **options)
 
 
@@ -86,10 +87,10 @@ def test_what_may_have_been_done_is_not_done_twice(pauses, error):
 def test_patience_ends_and_nobody_listens(pauses, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(connection.time, "monotonic", lambda: next(clock))
-    played = Played(*[httpx2.ConnectError("refused")] * 100)
+    played, said = Played(*[httpx2.ConnectError("refused")] * 100), []
     with pytest.raises(Unreachable, match=r"http://service\.test does not answer: refused"):
-        client(played, patience_s=50).jobs.get(JOB)
-    assert 1 < len(played.requests) < 10
+        client(played, patience_s=50, on_silence=said.append).jobs.get(JOB)
+    assert 1 < len(played.requests) < 10 and said == ["http://service.test does not answer: refused; asked again for 50 s"]
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # and never listens
         url = f"http://127.0.0.1:{taken.getsockname()[1]}"

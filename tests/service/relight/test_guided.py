@@ -44,7 +44,7 @@ def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
     folder, truth = scene
     plain = SURFACE.off(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
     kernel = SURFACE.off(relight(relit, folder, tmp_path / "b"), truth)
-    guided = SURFACE.off(relight(relit, folder, tmp_path / "c", "--maps", folder / "maps"), truth)
+    guided = SURFACE.off(relight(relit, folder, tmp_path / "c", "--maps", folder / "maps" / "maps.exr"), truth)
     assert guided < 0.5 * min(plain, kernel)
 
 

@@ -78,7 +78,7 @@ def test_layers_come_from_a_folder_of_maps_a_capture(relit, sequence, tmp_path):
     first, second = (exr.read(tmp_path / "f" / f"a.0{n}.exr")[0]["normal.X"].astype(float) for n in (1, 2))
     assert np.allclose(first, -second, atol=2e-3) and np.abs(first).max() > 0.5  # its lights are mirrored, and so are its normals
     (tmp_path / "maps" / "t10" / "maps.exr").unlink()
-    assert "maps/t10/maps.exr is not there: run `relit solve` first" in relit.refused(*arguments, "--overwrite")
+    assert "maps/t10/maps.exr: is not there: run `relit solve` first" in relit.refused(*arguments, "--overwrite")
 
 
 @pytest.mark.parametrize(("spoil", "options", "words"), [

@@ -177,6 +177,11 @@ def test_bad_shades(relit, maps, tmp_path, options, words):
     assert files_in(tmp_path) == set()
 
 
+def test_a_light_behind_the_object_is_said_to_reach_nothing(relit, maps, tmp_path):
+    outcome = relit("shade", maps, "--light", "0,0,-1,1,1,1", "--out", tmp_path / "p.exr")
+    assert "every value of the frames is 0: no light that was asked for reaches what the camera sees" in outcome.well()
+
+
 def test_maps_that_are_not_there(relit, tmp_path):
     assert "run `relit solve` first" in relit.refused("shade", tmp_path / "none", "--light", "0,0,1,1,1,1", "--out", tmp_path / "p.exr")
 

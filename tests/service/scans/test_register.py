@@ -278,6 +278,10 @@ def test_options_that_do_not_fit_are_refused(relit, tmp_path, options, sentence)
     assert sentence in relit.refused("register", write(tmp_path / "set", views(figure, 0, 30)), "--out", tmp_path / "out", *options)
 
 
+def test_a_folder_without_a_scan_set_is_told_what_writes_one(relit, tmp_path):
+    assert "holds no scan-set.json: `relit import scans` writes one" in relit.refused("register", tmp_path, "--out", tmp_path / "out")
+
+
 def test_the_input_is_not_replaced_and_one_scan_is_refused(relit, tmp_path):
     folder = write(tmp_path / "set", views(figure, 0, 30))
     assert "would replace" in relit.refused("register", folder, "--out", folder)

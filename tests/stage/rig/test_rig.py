@@ -59,6 +59,14 @@ def test_what_is_wrong_names_the_field(tmp_path, content, change, field):
     assert "rig.json" in str(error.value) and field in str(error.value)
 
 
+def test_a_folder_or_a_picture_in_place_of_a_rig_is_told_what_is_read(tmp_path):
+    with pytest.raises(ManifestError, match=r"is a folder: give a JSON file with the schema relit\.rig/1$"):
+        read_rig(tmp_path)
+    (tmp_path / "sky.exr").write_bytes(b"\x76\x2f\x31\x01\xff")
+    with pytest.raises(ManifestError, match=r"sky\.exr: is not UTF-8 text: this program reads JSON with the schema relit\.rig/1$"):
+        read_rig(tmp_path / "sky.exr")
+
+
 def test_the_patch_says_which_lamps_cannot_be_driven(tmp_path, content):
     assert list(patch_faults(read(tmp_path, content))) == []
     del content["lights"][0]["address"]

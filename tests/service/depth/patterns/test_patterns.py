@@ -11,6 +11,7 @@ from service.depth.patterns.projection import make_plan
 from service.requests.patterns import PatternCode, PlanRequest
 from stage.capture.manifest import Frame
 from stage.patterns.codes import collect, draw
+from tests.scenes.captures import files_in
 
 SIZE = (96, 40)
 
@@ -38,6 +39,16 @@ def test_sixteen_bits_and_gamma(relit, tmp_path):
     pixels, kind = read(tmp_path / "pattern_000.png")
     assert kind == "uint16"
     np.testing.assert_allclose(pixels[0, :, 0] ** 2.2, (np.arange(96) + 0.5) / 96, atol=2e-5)
+
+
+def test_images_of_an_earlier_run_go_and_other_files_stay(relit, tmp_path):
+    (tmp_path / "pattern_099.png").write_bytes(b"")  # before there is a patterns.json: of somebody else
+    relit.done("patterns", "phase", "--projector", "96x40", "--out", tmp_path / "out")
+    relit.done("patterns", "phase", "--projector", "96x40", "--out", tmp_path)
+    (tmp_path / "out" / "note.png").write_bytes(b"")
+    relit.done("patterns", "ramp", "--projector", "96x40", "--out", tmp_path / "out")
+    images = [frame["image"] for frame in json.loads((tmp_path / "out" / "patterns.json").read_text())["frames"]]
+    assert files_in(tmp_path / "out") == {*images, "patterns.json", "note.png"} and (tmp_path / "pattern_099.png").exists()
 
 
 def test_plan_is_a_table(relit):
