@@ -73,31 +73,28 @@ def residuals(volume: Volume, views: ViewArrays) -> tuple[np.ndarray, np.ndarray
 
 
 @wp.kernel(enable_backward=False)
-def _compare_kernel(first: int, skipped: int, reach: float, images: Measured, points: wp.array(dtype=wp.vec3),
+def _compare_kernel(first: int, reach: float, images: Measured, points: wp.array(dtype=wp.vec3),
                     normals: wp.array(dtype=wp.vec3), variance: wp.array(dtype=float),
                     # outputs
                     distance: wp.array2d(dtype=float), expected: wp.array2d(dtype=float)):
     i = first + wp.tid()
     for number in range(images.views.shape[0]):
-        if number != skipped:
-            view = images.views[number]
-            there = to_camera(view, points[i])
-            if in_front(view, there):
-                reading = read_view(view, there, image_point(view, there), images)
-                if (reading.known and wp.dot(turned_back(view, reading.normal), normals[i]) > SAME_SIDE
-                        and wp.abs(reading.distance) < reach):
-                    distance[i, number] = reading.distance
-                    expected[i, number] = wp.sqrt(reading.variance + variance[i])
+        view = images.views[number]
+        there = to_camera(view, points[i])
+        if in_front(view, there):
+            reading = read_view(view, there, image_point(view, there), images)
+            if reading.known and wp.dot(turned_back(view, reading.normal), normals[i]) > SAME_SIDE and wp.abs(reading.distance) < reach:
+                distance[i, number] = reading.distance
+                expected[i, number] = wp.sqrt(reading.variance + variance[i])
 
 
-def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, variance: np.ndarray, *, skipped: int, reach: float,
+def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, variance: np.ndarray, *, reach: float,
                   device: str) -> tuple[np.ndarray, np.ndarray]:
     """Compare points that one view measured with the surfaces that others measured there; waits for the device.
 
     Args:
         points, normals: [n, 3] metres in the coordinates of the views, and unit vectors of the world frame.
         variance: [n] square metres, of each point along its normal.
-        skipped: number of the view that measured the points, which are not compared with it; −1 where it is not among the views.
         reach: metres; surfaces farther off are other surfaces.
 
     Returns:
@@ -106,7 +103,7 @@ def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, va
     """
     distance, expected = (wp.zeros((len(points), views.count), dtype=float, device=device) for _ in range(2))
     devices.launch(_compare_kernel, len(points), [
-        skipped, reach, views.measured(),
+        reach, views.measured(),
         *(wp.array(values.astype(np.float32), dtype=kind, device=device) for values, kind in (
             (points, wp.vec3), (normals, wp.vec3), (variance, float)))], [distance, expected], device=device, uneven=True)
     return to_numpy(distance), to_numpy(expected)

@@ -189,7 +189,7 @@ class Acquisition:
             if shots[key].grey is not None and any(shot.pattern is not None and shot.key in self.journal.taken for shot in self.shots):
                 raise RequestError(f"--retake {key}: patterns have been shown by the response that it measured: begin a new capture")
             if key in self.journal.taken:
-                self.journal.picture(key, "rejected", {**self._files.withdraw(shots[key], self.journal.taken[key], 0), "faults": []})
+                self.journal.picture(key, "rejected", {**self._files.withdraw(shots[key], self.journal.taken[key]), "faults": []})
                 self.judge.forget(shots[key])
                 self.faults.pop(key, None)
 
@@ -300,7 +300,7 @@ class Acquisition:
             if self.faults.get(shot.key) or stopping.is_set():
                 continue
             self.retaken.append(fault)
-            self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line, 0), **said([fault])})
+            self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line), **said([fault])})
             self.judge.forget(shot)
             self._take(shot._replace(prompt=None), lights, stopping)
         self.faults = {key: found for key, found in self.faults.items() if key not in self.journal.taken}  # no picture came

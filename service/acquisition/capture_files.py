@@ -70,10 +70,10 @@ class CaptureFiles:
             shutil.copyfile(picture, temporary)
         return {"file": path.relative_to(self._folder).as_posix(), "source": picture.name}
 
-    def withdraw(self, shot: Shot, line: Mapping[str, Any], attempt: int) -> dict[str, Any]:
+    def withdraw(self, shot: Shot, line: Mapping[str, Any]) -> dict[str, Any]:
         """Move the picture that a shot has to the rejected ones, and return what the journal says of it."""
         path = self._folder / line["file"]
-        found = self.reject(shot, path, attempt)
+        found = self.reject(shot, path, 0)
         path.unlink()
         return {**found, "source": line["source"], "was_taken": True}
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.boards.findings import rounded, table_text
+from service.boards.findings import rounded
 from service.boards.study_checks import check_runs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
@@ -19,6 +19,7 @@ from service.requests.inspect_board import BoardCapabilityRequest
 from stage import inputs
 from stage.errors import BoardError, ManifestError
 from stage.files import write_text
+from stage.formats.csv_table import table_text
 from stage.records import read_record
 from stage.sets.board import GaugeRuns
 from stage.stack.fingerprint import digest
@@ -99,7 +100,7 @@ def board_capability(request: BoardCapabilityRequest, progress: Progress | None 
     found.sort(key=lambda each: each.cpk)
     table_path, report_path = request.out / CAPABILITY_FILE, request.out / REPORT_FILE
     rows = [rounded(each._asdict()) for each in found]
-    write_text(table_path, table_text(Capability._fields, rows))
+    write_text(table_path, table_text(Capability._fields, (row.values() for row in rows)))
     write_text(report_path, report(
         request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
         boards=len({run.board for run in runs.runs}), left_out=left_out, capability=rows, warnings=warnings,

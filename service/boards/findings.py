@@ -1,8 +1,6 @@
 """The rows that an inspection lists: defects, regions, and areas that were not inspected; and tables of boards as CSV."""
 
-import csv
-import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,15 +9,7 @@ from scipy.ndimage import find_objects, label
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import RegionResult
 from service.boards.stitching.significance import Scan, grown, mean_of, region_of, weighted_centre
-
-
-def table_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows under their columns as CSV; a column that a row lacks is empty."""
-    out = io.StringIO()
-    table = csv.DictWriter(out, columns, lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    return out.getvalue()
+from stage.formats.csv_table import table_text
 
 
 def six_digits(value: float) -> float:
@@ -150,7 +140,7 @@ def findings_csv(defects: Sequence[Defect], regions: Sequence[RegionResult], are
     for number, area in enumerate(areas, start=1):
         rows.append({"kind": "area", "name": f"area {number}", "verdict": "not inspected", **rounded(area._asdict()),
                      "measured_pixels": 0})
-    return table_text(COLUMNS, rows)
+    return table_text(COLUMNS, ([row.get(column) for column in COLUMNS] for row in rows))
 
 
 def entries(defects: Sequence[Defect], regions: Sequence[RegionResult]) -> dict[str, Any]:

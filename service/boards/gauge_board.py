@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import fdtrc
 from scipy.stats import chi2
 
-from service.boards.findings import six_digits, table_text
+from service.boards.findings import six_digits
 from service.boards.study_checks import check_runs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
@@ -22,6 +22,7 @@ from service.requests.inspect_board import GaugeBoardRequest
 from stage import inputs
 from stage.errors import BoardError, ManifestError
 from stage.files import write_text
+from stage.formats.csv_table import table_text
 from stage.records import read_record
 from stage.sets.board import GaugeRuns
 from stage.stack.fingerprint import digest
@@ -187,10 +188,9 @@ def _parts(path: Path, found: dict[tuple[str, str], list[dict[str, Any]]]) -> tu
 
 def _table(parts: list[_Part]) -> str:
     return table_text(COLUMNS, (
-        {"board": part.board, "region": part.region, "mean_m": f"{part.values.mean():.6g}",
-         "repeatability_m": f"{np.sqrt(part.values.var(axis=1, ddof=1).mean()) if part.values.shape[1] > 1 else 0:.6g}",
-         "sigma_m": f"{np.sqrt(np.square(part.sigmas).mean()):.6g}",
-         "values": " ".join(f"{value:.6g}" for value in part.values.ravel())} for part in parts))
+        [part.board, part.region, f"{part.values.mean():.6g}",
+         f"{np.sqrt(part.values.var(axis=1, ddof=1).mean()) if part.values.shape[1] > 1 else 0:.6g}",
+         f"{np.sqrt(np.square(part.sigmas).mean()):.6g}", " ".join(f"{value:.6g}" for value in part.values.ravel())] for part in parts))
 
 
 def gauge_study(values: np.ndarray) -> GaugeStudy:

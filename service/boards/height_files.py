@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.boards.stitching.form import without_plane
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch
 from service.boards.stitching.overlap import Evidence, Overlap, measure_overlap
 from service.boards.stitching.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched, TilePoints
@@ -193,9 +194,7 @@ def _check_unit(measured: HeightMap, nominal: Nominal) -> None:
     both = measured.measured & nominal.heights.measured
     for heights in (measured.height, nominal.heights.height):
         row, col = np.nonzero(both)
-        values = heights[both]
-        basis = np.stack([np.ones(row.size), row / heights.shape[0], col / heights.shape[1]], axis=1)
-        values = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        values = without_plane(heights[both], row / heights.shape[0], col / heights.shape[1])
         low, high = np.percentile(values, [1, 99])
         spans.append(float(high - low))
     noise = float(np.sqrt(np.median(measured.variance[both])))

@@ -11,7 +11,7 @@ import numpy as np
 
 from kernels import device as devices
 from service.boards.datum import Datum, find_mark, fit_datum, lay
-from service.boards.findings import six_digits, table_text
+from service.boards.findings import six_digits
 from service.boards.height_files import BOARD_FILE, write_board
 from service.boards.inspect_board import stitch_board, stitching_entries
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
@@ -28,6 +28,7 @@ from service.requests.inspect_board import BoardSide, InspectPasteRequest
 from stage.errors import BoardError
 from stage.files import write_text
 from stage.formats.centroids import names_of, read_components
+from stage.formats.csv_table import table_text
 from stage.formats.gerber import Pad, read_marks, read_pads
 from stage.sets.paste_limits import PadLimits, limits_of, read_limits
 from stage.stack.fingerprint import digest
@@ -108,7 +109,7 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
                                                             method=METHOD, contents=contents))
     pads_path, picture_path, report_path = (request.out / name for name in (PADS_FILE, PICTURE_FILE, REPORT_FILE))
     rows = [_row(result) for result in results]
-    write_text(pads_path, table_text(list(rows[0]), ({**row, "bridged_with": " ".join(row["bridged_with"])} for row in rows)))
+    write_text(pads_path, table_text(list(rows[0]), ({**row, "bridged_with": " ".join(row["bridged_with"])}.values() for row in rows)))
     full = np.where(openings_of(heights.grid, pads) > 0, request.stencil_m, 0.0)
     deviation = paste.height._replace(height=paste.height.height - full)
     write_picture(picture_path, heights, deviation, heights.measured, full > 0, [],

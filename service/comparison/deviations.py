@@ -2,8 +2,6 @@
 judged to be within their tolerances or not (ISO 14253-1).
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,6 +16,7 @@ from service.comparison.placing import ALIKE, Placement, gradient
 from service.comparison.surfaces import Design, Offsets, ScannedSurface
 from service.scans.points.rigid import applied
 from stage.errors import ScanError
+from stage.formats.csv_table import table_text
 from stage.sets.tolerance_regions import ToleranceRegion
 
 BATCH = 1 << 18
@@ -233,9 +232,5 @@ def _samples(region: ToleranceRegion, design: Design, unit_m: float, patch_m: fl
 
 def table(regions: Sequence[RegionVerdict]) -> str:
     """Return the verdicts as CSV."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(RegionVerdict._fields)
-    for region in regions:
-        writer.writerow(["" if value is None else f"{value:.9g}" if isinstance(value, float) else str(value) for value in region])
-    return text.getvalue()
+    return table_text(RegionVerdict._fields, ([f"{value:.9g}" if isinstance(value, float) else value for value in region]
+                                              for region in regions))

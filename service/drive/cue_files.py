@@ -13,6 +13,7 @@ from service.reporting.progress import Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.drive import DriveRequest
 from stage.files import write_text
+from stage.formats.csv_table import table_text
 from stage.rig.cues import CUES_FILE, Cues, FrameCue, UniverseCue, rig_digest, write_cues
 from stage.rig.patch import patch_faults, universe_values
 from stage.rig.rig import Rig
@@ -52,13 +53,7 @@ def cues_of(rig: Rig, quantised: Quantised, numbers: Sequence[int], rate: float)
 
 def write_table(path: Path, rows: Iterable[tuple[int, str, str, float]]) -> None:
     """Write a table of frame, lamp, primary and level whole or not at all."""
-    lines = [f"{number},{field_of(light)},{field_of(primary)},{level:.{DECIMALS}g}\n" for number, light, primary, level in rows]
-    write_text(path, "frame,light,primary,level\n" + "".join(lines))
-
-
-def field_of(text: str) -> str:
-    """Return a text as a field of CSV."""
-    return '"' + text.replace('"', '""') + '"' if any(sign in text for sign in ',"\n') else text
+    write_text(path, table_text(("frame", "light", "primary", "level"), ((*where, f"{level:.{DECIMALS}g}") for *where, level in rows)))
 
 
 WORTH_SAYING = 0.01

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.drive.cue_files import field_of
 from service.drive.judgement import environment_samples, irradiance_of
 from service.relight.environments import Environments
 from service.relight.sheet import BACKGROUND, write_sheet
@@ -17,6 +16,7 @@ from service.reporting.progress import Progress, Timings
 from service.requests.relight import LightWeights
 from service.requests.rig import RigPlanRequest
 from stage.files import write_text
+from stage.formats.csv_table import table_text
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
 
@@ -66,10 +66,9 @@ def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[
             timings.advance(len(rows))
     timings.stage("files", 1)
     request.out.mkdir(parents=True, exist_ok=True)
-    heads = ",".join(f"highlights_{roughness:g}_percent" for roughness in ROUGHNESS)
-    lines = "".join(f"{row.environment},{row.lights},{100 * row.irradiance:.4g},"
-                    f"{','.join(f'{100 * error:.4g}' for error in row.highlights)},{field_of(row.rig)}\n" for row in rows)
-    write_text(request.out / "plan.csv", f"environment,lights,irradiance_percent,{heads},rig\n{lines}")
+    columns = ["environment", "lights", "irradiance_percent", *(f"highlights_{roughness:g}_percent" for roughness in ROUGHNESS), "rig"]
+    write_text(request.out / "plan.csv", table_text(columns, (
+        [row.environment, row.lights, *(f"{100 * error:.4g}" for error in (row.irradiance, *row.highlights)), row.rig] for row in rows)))
     _plot(rows, request.out / "plan.png")
     timings.close()
     return rows

@@ -1,7 +1,5 @@
 """The twin of a stage: listen, show (the picture and the dome of lamps on a page), and write down what was received."""
 
-import csv
-import io
 import socket
 import tempfile
 import threading
@@ -30,6 +28,7 @@ from service.twin.listener import ANY, Listener
 from service.twin.local_page import HEADERS, page_address, page_socket
 from stage.errors import storage
 from stage.files import write_text
+from stage.formats.csv_table import table_text
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import Rig, read_rig
 
@@ -129,13 +128,10 @@ def _playing(player: Prepared | None) -> Iterator[None]:
 
 
 def _record(path: Path, rig: Rig, listener: Listener) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "time_s", *(f"{rig.lights[index].name}.{primary.name}" for index, primary in rig.emitters)])
-    for frame in listener.kept:
-        levels = levels_of_universes(rig, dict(frame.values))
-        table.writerow([frame.number, f"{frame.time_s:.6f}", *(f"{level:.9g}" for level in levels)])
-    write_text(path, text.getvalue())
+    columns = ["frame", "time_s", *(f"{rig.lights[index].name}.{primary.name}" for index, primary in rig.emitters)]
+    write_text(path, table_text(columns, (
+        [frame.number, f"{frame.time_s:.6f}", *(f"{level:.9g}" for level in levels_of_universes(rig, dict(frame.values)))]
+        for frame in listener.kept)))
 
 
 def serve_page(listening: socket.socket, rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCamera | None) -> None:

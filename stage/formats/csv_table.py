@@ -1,8 +1,9 @@
 """Tables of a CSV file whose first line names its columns."""
 
 import csv
+import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from stage import inputs
@@ -39,6 +40,15 @@ def read_table(path: Path, columns: Sequence[str]) -> "csv.DictReader[str]":
             hint = ": part columns by semicolons where numbers have decimal commas" if separator is None else ""
             raise ManifestError(f"{path}: line {cells.line_num}: has {len(row)} cells, the first line names {len(heads)} columns{hint}")
     return rows
+
+
+def table_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return rows under the names of their columns as CSV; None is an empty cell."""
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(columns)
+    table.writerows(rows)
+    return out.getvalue()
 
 
 def _with_commas(lines: Sequence[str], separator: str) -> Iterator[str]:

@@ -128,17 +128,25 @@ def distant(direction: np.ndarray, irradiance: float | np.ndarray) -> dict[str, 
     return {"type": "distant", "direction": direction.tolist(), "irradiance": np.broadcast_to(irradiance, 3).astype(float).tolist()}
 
 
+def write_images(folder: Path, images: Iterable[np.ndarray], entries: Iterable[dict[str, Any]], names: str = "{:03d}.exr"
+                 ) -> list[dict[str, Any]]:
+    """Write images [rows, cols, 3] or grey [rows, cols], and return the frames of the manifest: their entries with their names."""
+    frames = []
+    for index, (image, entry) in enumerate(zip(images, entries, strict=True)):
+        write_exr(folder / names.format(index), image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
+        frames.append({"image": names.format(index), **entry})
+    return frames
+
+
 def write_lit(folder: Path, images: Iterable[np.ndarray], lights: Iterable[dict[str, Any]], *, camera: dict[str, Any],
               mask: np.ndarray | None = None, names: str = "{:03d}.exr", **changes: Any) -> Path:
-    """Write a capture of images [rows, cols, 3], each under the light of its entry; the mask [rows, cols] is bool, or coverage in 16 bits.
+    """Write a capture of images [rows, cols, 3] or grey [rows, cols], each under the light of its entry; the mask [rows, cols] is bool, or
+    coverage in 16 bits.
 
     Returns:
         The folder.
     """
-    frames = []
-    for index, (image, light) in enumerate(zip(images, lights, strict=True)):
-        write_exr(folder / names.format(index), image)
-        frames.append({"image": names.format(index), "light": light})
+    frames = write_images(folder, images, ({"light": light} for light in lights), names)
     if mask is not None:
         write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
         changes = {"mask": "mask.png", **changes}

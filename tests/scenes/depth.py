@@ -105,6 +105,11 @@ def gray_patterns(axis: str, *, stripe: int = 1, inverse: bool = True) -> list[d
             for bit in reversed(range(bits)) for turned in ((False, True) if inverse else (False,))]
 
 
+def entries_of(patterns: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The entries of frames that show these patterns, without their images."""
+    return [{"pattern": pattern} for pattern in patterns]
+
+
 def phase_patterns(axis: str, period: float, steps: int = 4) -> list[dict[str, Any]]:
     return [{"code": "phase", "axis": axis, "period_px": period, "step": step, "steps": steps} for step in range(steps)]
 

@@ -70,6 +70,12 @@ def fit_spline(grid: BoardGrid, height: np.ndarray, *, knots_m: float) -> Spline
     return Spline(coefficients.reshape(down, across), scale**2 * np.linalg.pinv(basis @ basis.T + more.T @ more, hermitian=True))
 
 
+def without_plane(values: np.ndarray, x: np.ndarray, y: np.ndarray, kept: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Return values at places, all [n], less the plane that fits them best, or those `kept` of them."""
+    basis = np.stack([np.ones(x.size), x, y], axis=1)
+    return np.asarray(values - basis @ np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0])
+
+
 def _middles(grid: BoardGrid, height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the medians of blocks of heights, and the middles x and y, from -1 to 1, of what is measured in them, all [blocks]."""
     side = max(1, min(BLOCK_PX, *(length // 6 for length in height.shape)))

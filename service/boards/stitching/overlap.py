@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from service.boards.stitching.form import without_plane
 from service.boards.stitching.grid import BLOCK_PX, BoardGrid, HeightPatch, bends, blocks_of, edge_variance, gradients, robust_sigma
 from service.boards.stitching.shift_search import LEAST_PIXELS, SHARED_PX, find_shifts
 from stage.spread import tukey_weights
@@ -240,7 +241,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     moved = solution.copy()  # the whole shift belongs to the difference: first − second = fitted − the shift of the second
     moved[0] -= shift[1] * grid.pixel_m
     moved[1] += shift[0] * grid.pixel_m
-    flat = [_without_plane(values[both], x, y) for values in (common.first, common.second)]
+    flat = [without_plane(values[both], x, y) for values in (common.first, common.second)]
     spread = [robust_range(values) for values in flat]
     noises = [float(np.sqrt(np.median(patch.variance[patch.measured]) * patch.noise_share)) for patch in (first, second)]
     clipped = [np.clip(values, *np.percentile(values, [0.5, 99.5])) for values in flat]
@@ -268,11 +269,6 @@ def robust_range(values: np.ndarray) -> float:
     """Return a quarter of the span from the 2nd to the 98th percentile, which is σ of a normal distribution within 3 %."""
     low, high = np.percentile(values, [2, 98])
     return float(high - low) / 4.1
-
-
-def _without_plane(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    basis = np.stack([np.ones_like(x), x, y], axis=1)
-    return np.asarray(values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0])
 
 
 def _diagonal(normal: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ Source: Padfield, "Masked object registration in the Fourier domain", IEEE Trans
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from service.boards.stitching.form import without_plane
 from service.boards.stitching.grid import HeightPatch, robust_sigma
 
 MOST_CANDIDATES = 8
@@ -56,8 +57,7 @@ def _detrended(patch: HeightPatch, top: int, left: int, shape: tuple[int, ...], 
     y, x = np.nonzero(there)
     values = window[there]
     kept = np.abs(values - np.median(values)) <= 5 * max(robust_sigma(values), 1e-12)
-    basis = np.stack([np.ones(x.size), x / window.shape[1], y / window.shape[0]], axis=1)
-    values = values - basis @ np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
+    values = without_plane(values, x / window.shape[1], y / window.shape[0], kept)
     window[there] = np.clip(values, *np.percentile(values, [0.5, 99.5]))
     return window
 

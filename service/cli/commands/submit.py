@@ -10,16 +10,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.progress import ProgressBar
-from service.cli.remote import (
-    CancelOption,
-    KeyOption,
-    ResultsOption,
-    ServerOption,
-    WaitOption,
-    connected,
-    make_folder,
-    wait_for,
-)
+from service.cli.remote import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected, make_folder, wait_for
 from service.cli.request_commands import Given, command
 from service.errors import RequestError
 from service.requests.base.base import JobRequest

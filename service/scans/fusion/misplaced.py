@@ -86,7 +86,7 @@ def readings_of(scan: PreparedScan, number: int, samples: list[Sample], reach: f
     views = upload_views([scan.image], origin, device=device)
     whole = Sample(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
     distance, expected = (values[:, 0].copy() for values in compare_views(
-        views, whole.points - origin, whole.normals, whole.variance, skipped=-1, reach=reach, device=device))
+        views, whole.points - origin, whole.normals, whole.variance, reach=reach, device=device))
     first = sum(len(sample.points) for sample in samples[:number])
     expected[first:first + len(samples[number].points)] = 0
     at = np.flatnonzero(expected)

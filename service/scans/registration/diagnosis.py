@@ -6,15 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.scans.points.scan import Scan
-from service.scans.registration.pairs import (
-    SCALE_LEAST,
-    SCALE_SIGMAS,
-    Pair,
-    PairState,
-    Prepared,
-    prepare,
-    search,
-)
+from service.scans.registration.pairs import SCALE_LEAST, SCALE_SIGMAS, Pair, PairState, Prepared, prepare, search
 
 FACTORS = {0.001: "as if it were in millimetres", 0.01: "as if it were in centimetres", 0.0254: "as if it were in inches",
            1000.0: "as if the others were in millimetres", 100.0: "as if the others were in centimetres",

@@ -9,17 +9,7 @@ from service.scans.points.cloud import Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, inverse
 from service.scans.registration.coarse import fpfh
 from service.scans.registration.look_alikes import told_from_shifted, told_from_turned
-from service.scans.registration.pairs import (
-    FEATURE_CELLS,
-    FINE_POINTS,
-    ROUGH_POINTS,
-    Pair,
-    PairState,
-    Prepared,
-    overlap_of,
-    refine,
-    search,
-)
+from service.scans.registration.pairs import FEATURE_CELLS, FINE_POINTS, ROUGH_POINTS, Pair, PairState, Prepared, overlap_of, refine, search
 
 START_CELLS, NEAR_CELLS = 2.0, 1.0
 """Points of two scans overlap, at starts or at poses that were found, if they are at most this many cells apart."""

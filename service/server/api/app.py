@@ -7,20 +7,7 @@ from fastapi.telemetry import TelemetryConfig
 from opentelemetry.trace import TracerProvider
 
 from service import __version__
-from service.server.api import (
-    document,
-    events,
-    hooks,
-    importing,
-    intakes,
-    jobs,
-    middleware,
-    operations,
-    problems,
-    results,
-    tus,
-    uploads,
-)
+from service.server.api import document, events, hooks, importing, intakes, jobs, middleware, operations, problems, results, tus, uploads
 from service.server.api.context import Service, require_admin
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics

@@ -11,7 +11,7 @@ from service.requests.base.option_values import Circle
 from service.requests.calibrate import MirrorBallRequest
 from stage.errors import CalibrationError
 from tests.reference.balls import render
-from tests.scenes.captures import angles_degrees, write_exr, write_manifest
+from tests.scenes.captures import angles_degrees, write_lit
 from tests.service.calibrate.solvers.balls import spread, unit
 
 WIDTH, HEIGHT, RADIUS = 200, 160, 60
@@ -42,14 +42,10 @@ def lamp(direction, degrees=2.0, radiance=1.0):
 
 def write(folder, images, **camera):
     random = np.random.default_rng(2)
-    for number, values in enumerate(images):
-        noisy = np.maximum(values + 0.001 * random.normal(size=values.shape), 0)
-        write_exr(folder / f"{number:03d}.exr", np.repeat(np.minimum(noisy, 1.0)[..., None], 3, axis=2))
+    noisy = (np.clip(values + 0.001 * random.normal(size=values.shape), 0, 1) for values in images)
     placeholder = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "ball", "saturation": 0.99,
-                            "camera": {"projection": "orthographic", "resolution": [WIDTH, HEIGHT], **camera},
-                            "frames": [{"image": f"{i:03d}.exr", "light": placeholder} for i in range(len(images))]})
-    return folder
+    return write_lit(folder, noisy, [placeholder] * len(images), saturation=0.99,
+                     camera={"projection": "orthographic", "resolution": [WIDTH, HEIGHT], **camera})
 
 
 def measured(folder, circles=NAMED):

@@ -19,7 +19,7 @@ from tests.scenes.captures import (
     write_capture,
     write_exr,
     write_image,
-    write_manifest,
+    write_lit,
 )
 
 WIDTH, HEIGHT = 96, 80
@@ -43,15 +43,9 @@ def grey_images():
 
 def write(folder, images, lights=None, **changes):
     """A capture of these images; its lights are placeholders unless given."""
-    lights = lights or [PLACEHOLDER] * len(images)
-    for index, image in enumerate(images):
-        write_exr(folder / f"{index:03d}.exr", np.repeat(image[..., None], 3, axis=2))
     rows, cols = images[0].shape
-    write_manifest(folder, {
-        "schema": "relit.capture/1", "name": "ball",
-        "camera": {"projection": "orthographic", "resolution": [cols, rows], "pixel_size_m": 0.001},
-        "frames": [{"image": f"{i:03d}.exr", "light": light} for i, light in enumerate(lights)], **changes})
-    return folder
+    return write_lit(folder, images, lights or [PLACEHOLDER] * len(images), **{
+        "name": "ball", "camera": {"projection": "orthographic", "resolution": [cols, rows], "pixel_size_m": 0.001}, **changes})
 
 
 def mask_of(path, image):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stage.capture.capture import Capture
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
-from tests.scenes.captures import edit_manifest, write_exr, write_manifest
+from tests.scenes.captures import edit_manifest, write_images, write_manifest
 from tests.scenes.depth import entry_of
 from tests.service.calibrate.solvers.test_procam import BOARD, CAMERA, SQUARE, board_image, poses
 
@@ -27,13 +27,12 @@ def unit(vector):
 def photograph(folder, points, albedo, planes=PLANES, noise=0.002):
     """Frames of each plane on a surface, and one under the light of the room."""
     random = np.random.default_rng(5)
-    frames = []
-    for number, plane in enumerate([*planes, None]):
+    images = []
+    for plane in [*planes, None]:
         glow = 0.0 if plane is None else 0.6 * np.exp(-(((points - plane[0]) @ unit(plane[1])) ** 2) / (2 * WIDTH**2))
         image = albedo * (0.2 + glow)
-        image = image + random.normal(0, noise, image.shape)
-        write_exr(folder / f"{number}.exr", np.repeat(np.maximum(image, 0)[..., None], 3, axis=2))
-        frames.append({"image": f"{number}.exr", **({"light": {"type": "off"}} if plane is None else {"laser": PLACEHOLDER})})
+        images.append(np.maximum(image + random.normal(0, noise, image.shape), 0))
+    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * len(planes), {"light": {"type": "off"}}], "{}.exr")
     write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "camera": {"projection": "perspective", **entry_of(CAMERA)},
                             "frames": frames})
     return folder

@@ -322,8 +322,7 @@ def test_what_is_wrong_with_several_cameras_is_said(relit, tmp_path):
             (scene(tmp_path / "bare", other_cameras=None, frames=[{"image": "left.png", "light": {"type": "full"}}]), given,
              "frames: none has stereo images")):
         if folder.name == "bare":
-            data = json.loads((folder / "capture.json").read_text())
-            write_manifest(folder, {key: value for key, value in data.items() if value is not None})
+            edit_manifest(folder)
         assert says in relit.refused("calibrate", "stereo", folder, *arguments)
     assert (board / "capture.json").read_text() == before
     half = scene(tmp_path / "half", other_cameras=[{**UNKNOWN, "focal_px": [500, 500]}])

@@ -10,17 +10,7 @@ from stage.formats import exr
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
-from tests.scenes.depth import (
-    AMBIENT,
-    BLACK_WHITE,
-    NORMAL,
-    POSE,
-    PROJECTOR,
-    gray_patterns,
-    make_scene,
-    phase_patterns,
-    write_patterns,
-)
+from tests.scenes.depth import AMBIENT, BLACK_WHITE, NORMAL, POSE, PROJECTOR, gray_patterns, make_scene, phase_patterns, write_patterns
 
 SCENE = make_scene()
 LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded

@@ -11,7 +11,7 @@ from service.requests.depth import SeparateRequest
 from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.results.depth_normals import depth_normals
-from tests.scenes.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
+from tests.scenes.captures import edit_manifest, files_in, write_exr, write_image, write_images, write_manifest
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"
 ROWS, COLS = 12, 20
@@ -34,17 +34,16 @@ def write(folder: Path, patterns: list[dict], *, leak: float = 0.0, ambient: flo
     """A capture whose pixels see places spread over the projector, in EXR."""
     direct, indirect = known()
     place = np.random.default_rng(1).uniform(100, 900, (2, ROWS, COLS))
-    frames = []
-    for number, pattern in enumerate(patterns):
+    images = []
+    for pattern in patterns:
         if pattern["code"] == "phase":
             turns = place[int(pattern["axis"] == "row")] / pattern["period_px"] - pattern["step"] / pattern["steps"]
             level = ((1 + np.cos(2 * np.pi * turns[..., None])) / 2) ** gamma
             mean = (((1 + np.cos(np.arange(400) / 200 * np.pi)) / 2) ** gamma).mean()
         else:
             level = mean = float(pattern["code"] == "white")
-        image = ambient + direct * (leak + (1 - leak) * level) + indirect * (leak + (1 - leak) * mean)
-        write_exr(folder / f"{number}.exr", image)
-        frames.append({"image": f"{number}.exr", "pattern": pattern})
+        images.append(ambient + direct * (leak + (1 - leak) * level) + indirect * (leak + (1 - leak) * mean))
+    frames = write_images(folder, images, [{"pattern": pattern} for pattern in patterns], "{}.exr")
     camera = {"projection": "orthographic", "resolution": [COLS, ROWS]}
     write_manifest(folder, {"schema": "relit.capture/1", "name": "wax", "camera": camera, "frames": frames, **changes})
     return folder

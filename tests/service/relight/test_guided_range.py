@@ -9,7 +9,7 @@ from kernels.relight.directions.direction_grid import direction_grid
 from kernels.relight.model.responses import respond
 from stage.capture.camera import Camera
 from tests.kernels.scenes import cap
-from tests.scenes.captures import rgb, write_exr
+from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 
 SURFACE = dome()
@@ -31,10 +31,8 @@ def scene(request, tmp_path_factory):
     if request.param == "perspective":
         size = len(SURFACE.mask)
         camera = Camera(projection="perspective", resolution=(size, size), focal_px=(60.0, 60.0), principal_px=(size / 2, size / 2))
-        capture = json.loads((folder / "cap" / "capture.json").read_text())
-        capture["camera"] = {"projection": "perspective", "resolution": [size, size], "focal_px": [60, 60],
-                             "principal_px": [size / 2, size / 2]}
-        (folder / "cap" / "capture.json").write_text(json.dumps(capture))
+        edit_manifest(folder / "cap", camera={"projection": "perspective", "resolution": [size, size], "focal_px": [60, 60],
+                                              "principal_px": [size / 2, size / 2]})
         write_maps(folder / "maps", SURFACE, camera, height=(SURFACE.height - 60 * PIXEL_M).astype(np.float32))
     else:
         write_maps(folder / "maps", SURFACE)

@@ -90,8 +90,7 @@ def test_frames_are_what_openimageio_makes_of_the_images(relit, logged, tmp_path
 def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, logged, tmp_path, monkeypatch):
     """The same name in a configuration with another curve: neither the stack nor the frame is taken again."""
     folder, _ = logged
-    data = json.loads((folder / "capture.json").read_text())
-    (folder / "capture.json").write_text(json.dumps({**data, "color_space": "house gamma"}))
+    edit_manifest(folder, color_space="house gamma")
     minimal(tmp_path / "one.ocio")
     (tmp_path / "two.ocio").write_text((tmp_path / "one.ocio").read_text().replace("2.5", "2.0"))
     frames = []

@@ -15,15 +15,7 @@ from service.solve.base import batches
 from service.solve.solve import help_solve, solve
 from stage.stack import stack
 from tests.service.owl import write_small_owl
-from tests.service.sharing.test_several_devices import (
-    BAND_BYTES,
-    BATCH_BYTES,
-    CAPTURES,
-    SEARCH_BYTES,
-    distant,
-    extended,
-    with_ball,
-)
+from tests.service.sharing.test_several_devices import BAND_BYTES, BATCH_BYTES, CAPTURES, SEARCH_BYTES, distant, extended, with_ball
 
 
 class Store:

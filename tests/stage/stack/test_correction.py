@@ -11,16 +11,7 @@ from stage.errors import ImageError
 from stage.stack.brackets import merge_brackets, one_frame_a_light
 from stage.stack.correction import CodedRadiance, Correction, Radiance
 from stage.stack.ingest import open_stack
-from tests.scenes.captures import (
-    edit_frame,
-    edit_manifest,
-    make_scene,
-    manifest_of,
-    write_capture,
-    write_exr,
-    write_image,
-    write_manifest,
-)
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, manifest_of, write_capture, write_exr, write_image, write_manifest
 
 SCENE = make_scene(size=8, lights=4)
 RNG = np.random.default_rng(11)

@@ -1,7 +1,5 @@
 """Frames that hold part of the next pattern are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -14,8 +12,8 @@ from service.depth.patterns.pattern_checks import Sample
 from service.requests.depth import DepthRequest
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
-from tests.scenes.captures import write_exr, write_image
-from tests.scenes.depth import AMBIENT, gray_patterns, make_scene, manifest, phase_patterns, shown
+from tests.scenes.captures import write_image, write_images, write_manifest
+from tests.scenes.depth import AMBIENT, entries_of, gray_patterns, make_scene, manifest, phase_patterns, shown
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 SEVERAL = [*phase_patterns("column", 16.0), *phase_patterns("column", 18.0), *phase_patterns("column", 21.0)]
@@ -33,11 +31,7 @@ def measured(folder, scene, patterns, part, *, gamma=1.0):
     rng = np.random.default_rng(4)
     light = np.array([scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv) * ~scene.shaded + AMBIENT) for pattern in patterns])
     light = ((1 - part) * light + part * np.roll(light, -1, axis=0)) ** gamma
-    frames = []
-    for number, (image, pattern) in enumerate(zip(light, patterns, strict=True)):
-        write_exr(folder / f"{number:02d}.exr", np.repeat((image + rng.normal(0, NOISE, image.shape))[..., None], 3, axis=-1))
-        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
-    (folder / "capture.json").write_text(json.dumps(manifest(frames)))
+    write_manifest(folder, manifest(write_images(folder, light + rng.normal(0, NOISE, light.shape), entries_of(patterns))))
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
 
 
@@ -59,16 +53,12 @@ def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
 
 def test_three_steps_of_a_declared_response_raise_no_doubt(tmp_path, scene):
     """Three shifts do not even out the third harmonic of a response that is steep in the middle: their sums differ as it says."""
-    frames = []
-    rng = np.random.default_rng(4)
-    for number, pattern in enumerate(THREE):
-        level = shown(pattern, scene.uv)
-        light = scene.albedo[..., 1] * (0.8 * level**2 * (3 - 2 * level) * ~scene.shaded + AMBIENT) + rng.normal(0, NOISE, level.shape)
-        write_exr(tmp_path / f"{number:02d}.exr", np.repeat(light[..., None], 3, axis=-1))
-        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
-    data, levels = manifest(frames), np.linspace(0, 1, 33)
+    level = np.array([shown(pattern, scene.uv) for pattern in THREE])
+    light = scene.albedo[..., 1] * (0.8 * level**2 * (3 - 2 * level) * ~scene.shaded + AMBIENT)
+    light = light + np.random.default_rng(4).normal(0, NOISE, level.shape)
+    data, levels = manifest(write_images(tmp_path, light, entries_of(THREE))), np.linspace(0, 1, 33)
     data["projector"]["response"] = (levels**2 * (3 - 2 * levels)).tolist()
-    (tmp_path / "capture.json").write_text(json.dumps(data))
+    write_manifest(tmp_path, data)
     result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
     assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
     assert result.maps.mask[~scene.shaded].mean() > 0.9
@@ -83,7 +73,7 @@ def test_frames_that_are_clipped_are_not_called_mixed(tmp_path, scene):
         name = f"{number:02d}.png"
         write_image(tmp_path / name, np.repeat(np.rint(np.clip(light, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=-1))
         frames.append({"image": name, "pattern": pattern})
-    (tmp_path / "capture.json").write_text(json.dumps(manifest(frames, color_space="lin_rec709_scene")))
+    write_manifest(tmp_path, manifest(frames, color_space="lin_rec709_scene"))
     result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
     assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
 

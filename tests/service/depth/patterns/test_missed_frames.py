@@ -1,6 +1,5 @@
 """Frames that the projector missed are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
 
-import json
 from shutil import copyfile
 
 import numpy as np
@@ -9,8 +8,8 @@ import pytest
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
 from tests.marks import first_short
-from tests.scenes.captures import write_exr, write_image
-from tests.scenes.depth import AMBIENT, BLACK_WHITE, gray_patterns, make_scene, manifest, phase_patterns, shown
+from tests.scenes.captures import write_image, write_images, write_manifest
+from tests.scenes.depth import AMBIENT, BLACK_WHITE, entries_of, gray_patterns, make_scene, manifest, phase_patterns, shown
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 INVERSES = gray_patterns("column", stripe=2)
@@ -33,18 +32,17 @@ def measured(folder, scene, patterns, *, dark=(), again=(), copies=None, columns
     """What relit depth says of frames of which some are dark, some show once more what the frame before shows, and some are the files of
     others, and what it makes of some columns of them."""
     rng = np.random.default_rng(4)
-    frames, before = [], np.zeros(scene.depth.shape)
+    images, before = [], np.zeros(scene.depth.shape)
     for number, pattern in enumerate(patterns):
         before = before if number in again else shown(pattern, scene.uv) * (number not in dark)
-        image = scene.albedo[..., 1] * (0.8 * before * ~scene.shaded + AMBIENT)
-        write_exr(folder / f"{number:02d}.exr", np.repeat((image + noise * rng.normal(0, 1, image.shape))[..., None], 3, axis=-1))
-        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
+        images.append(scene.albedo[..., 1] * (0.8 * before * ~scene.shaded + AMBIENT) + noise * rng.normal(0, 1, before.shape))
+    frames = write_images(folder, images, entries_of(patterns), "{:02d}.exr")
     for number, source in (copies or {}).items():
         copyfile(folder / f"{source:02d}.exr", folder / f"{number:02d}.exr")
     mask = np.zeros(scene.depth.shape, np.uint8)
     mask[:, columns or slice(None)] = 255
     write_image(folder / "mask.png", mask)
-    (folder / "capture.json").write_text(json.dumps(manifest(frames, mask="mask.png")))
+    write_manifest(folder, manifest(frames, mask="mask.png"))
     result = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
     return [warning for warning in result.warnings if "missed" in warning or "copy" in warning], result.maps.mask
 

@@ -1,15 +1,13 @@
 """Three phase frames alone under a projector that bends waves: σ holds the error, and a sentence says so. The scene and its images are
 those of tests/scenes/depth.py."""
 
-import json
-
 import numpy as np
 import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
-from tests.scenes.captures import write_exr
-from tests.scenes.depth import AMBIENT, PROJECTOR, make_scene, manifest, phase_patterns, shown
+from tests.scenes.captures import write_images, write_manifest
+from tests.scenes.depth import AMBIENT, PROJECTOR, entries_of, make_scene, manifest, phase_patterns, shown
 
 NOISE = 0.003
 
@@ -22,12 +20,9 @@ def scene():
 def measured(folder, scene, gamma, ambient):
     """What relit depth makes of one wave over the whole projector, its three steps alone."""
     rng, patterns = np.random.default_rng(6), phase_patterns("column", float(PROJECTOR.width), 3)
-    frames = []
-    for number, pattern in enumerate(patterns):
-        light = scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv)**gamma * ~scene.shaded + ambient)
-        write_exr(folder / f"{number}.exr", np.repeat((light + rng.normal(0, NOISE, light.shape))[..., None], 3, axis=-1))
-        frames.append({"image": f"{number}.exr", "pattern": pattern})
-    (folder / "capture.json").write_text(json.dumps(manifest(frames)))
+    level = np.array([shown(pattern, scene.uv) for pattern in patterns])
+    light = scene.albedo[..., 1] * (0.8 * level**gamma * ~scene.shaded + ambient) + rng.normal(0, NOISE, level.shape)
+    write_manifest(folder, manifest(write_images(folder, light, entries_of(patterns))))
     return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", least_confidence=0))
 
 

@@ -16,7 +16,7 @@ from service.calibrate.tof import calibrate_tof
 from service.requests import calibrate as requests
 from service.requests.chart import ChartRequest
 from tests.reference import tof
-from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr
 from tests.scenes.chart import CAMERA, Pose, picture, reflectances, shoot, table
 from tests.service.calibrate import test_rig as lamps
 from tests.service.calibrate.solvers import test_procam as boards
@@ -72,7 +72,7 @@ def sensor(tmp_path_factory):
     for number, level in enumerate(LEVELS):
         write_exr(folder / f"grey{number}.exr", 0.01 + 0.1 * ramp * level**2.2)
     projector = {"resolution": [64, 48], "focal_px": [60, 60], "camera_from_projector": np.eye(4).tolist()}
-    write_manifest(folder, json.loads((folder / "capture.json").read_text()) | {"projector": projector})
+    edit_manifest(folder, projector=projector)
     return folder
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
-from tests.scenes.captures import angles_degrees
+from tests.scenes.captures import angles_degrees, edit_manifest
 from tests.scenes.near_lights import lamps
 
 DOME = near_lights.dome(40, perspective=True)
@@ -18,10 +18,7 @@ RNG = np.random.default_rng(3)
 
 def capture(folder, lights, told=None, scene=DOME):
     near_lights.write(folder, scene, lights, told=told)
-    path = folder / "capture.json"
-    manifest = json.loads(path.read_text())
-    del manifest["camera"]["surface_z_m"]
-    path.write_text(json.dumps(manifest))
+    edit_manifest(folder, camera={name: value for name, value in scene.camera.items() if name != "surface_z_m"})
     return folder
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from tests.scenes.captures import angles_degrees, make_scene, manifest_of, ring, write_capture, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, make_scene, manifest_of, ring, write_capture, write_exr, write_lit
 from tests.scenes.ellipsoid import ellipsoid, seen_from_near
 from tests.scenes.parts import Part, shoot, sphere_lights
 
@@ -175,16 +175,13 @@ def test_a_perspective_camera_sees_wrong_axes_too(tmp_path):
 def test_the_axes_of_gradients_are_examined(tmp_path):
     """A convex Lambertian surface under (1 ± axis)/2 has radiance albedo/2 · (1 ± ⅔ n)."""
     for name, wrong in (("right", ""), ("wrong", "y")):
-        frames = []
+        images, lights = [], []
         for axis in "xyz":
             for sign in (1, -1):
-                image = f"{axis}{sign}.exr"
                 shade = (1 + sign * 2 / 3 * SCENE.normal[..., "xyz".index(axis)]) / 2
-                write_exr(tmp_path / name / image, SCENE.albedo * shade[..., None])
-                frames.append({"image": image, "light": {"type": "gradient", "axis": axis, "sign": -sign if axis == wrong else sign,
-                                                         "polarization": "cross"}})
-        write_image(tmp_path / name / "mask.png", (SCENE.mask * 255).astype(np.uint8))
-        write_manifest(tmp_path / name, manifest_of(SCENE, frames=frames))
+                images.append(SCENE.albedo * shade[..., None])
+                lights.append({"type": "gradient", "axis": axis, "sign": -sign if axis == wrong else sign, "polarization": "cross"})
+        write_lit(tmp_path / name, images, lights, camera=manifest_of(SCENE)["camera"], mask=SCENE.mask)
         result = solve(SolveRequest(capture=tmp_path / name, out=tmp_path / name / "out", device="cpu"))
         assert bool(alarms(result)) == bool(wrong)
     assert "frames[].light.axis and sign: " in alarms(result)[0] and "with y negated" in alarms(result)[0]

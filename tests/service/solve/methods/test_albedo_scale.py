@@ -10,7 +10,7 @@ from service.solve.methods.shadow_light import fit_albedo_scale, shown_bounce
 from service.solve.solve import solve
 from tests.kernels.scenes import cap
 from tests.reference.groove import Groove
-from tests.scenes.captures import write_exr, write_manifest
+from tests.scenes.captures import distant, write_lit
 
 pytestmark = pytest.mark.long
 
@@ -92,14 +92,9 @@ def groove_capture(folder, *, scale: float, declared: str | None, bounced: bool 
     """A groove, with all bounces or none, under 40 lights whose irradiance is declared `scale` times too large."""
     lights = cap(40, 70.0)
     whole, direct = Groove(SIDE).radiance(lights, ALBEDO)
-    frames = []
-    for index, (light, image) in enumerate(zip(lights, whole if bounced else direct, strict=True)):
-        write_exr(folder / f"{index:03d}.exr", np.repeat(image.reshape(SIDE, SIDE, 1), 3, axis=2))
-        frames.append({"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": light.tolist(), "irradiance": [scale] * 3}})
-    data = {"schema": "relit.capture/1", "name": "groove", "camera": {"projection": "orthographic", "resolution": [SIDE, SIDE]},
-            "frames": frames}
-    write_manifest(folder, data | ({} if declared is None else {"irradiance_scale": declared}))
-    return folder
+    return write_lit(folder, (whole if bounced else direct).reshape(-1, SIDE, SIDE), [distant(light, scale) for light in lights],
+                     camera={"projection": "orthographic", "resolution": [SIDE, SIDE]},
+                     **({} if declared is None else {"irradiance_scale": declared}))
 
 
 def solved(folder, out):

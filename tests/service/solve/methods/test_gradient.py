@@ -9,7 +9,7 @@ from service.solve.methods.gradient import PART, neighbours_doubt
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
 from tests.reference import gradient as reference
-from tests.scenes.captures import angles_degrees, make_scene, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, make_scene, write_lit, write_manifest
 
 SIZE, ROUGHNESS = 12, 0.2
 PAIRS = [(axis, sign) for axis in "xyz" for sign in (1, -1)]
@@ -38,16 +38,8 @@ def highlight() -> np.ndarray:
 
 def write(folder, groups: dict[str, np.ndarray], **changes):
     """A capture of the six gradients in each polarisation."""
-    frames = []
-    for kind, images in groups.items():
-        for (axis, sign), image in zip(PAIRS, images, strict=True):
-            name = f"{kind}-{axis}{'+' if sign > 0 else '-'}.exr"
-            write_exr(folder / name, image)
-            frames.append({"image": name, "light": {"type": "gradient", "axis": axis, "sign": sign, "polarization": kind}})
-    write_image(folder / "mask.png", (SCENE.mask * 255).astype(np.uint8))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "head", "mask": "mask.png", "camera": CAMERA, "frames": frames,
-                            **changes})
-    return folder
+    lights = [{"type": "gradient", "axis": axis, "sign": sign, "polarization": kind} for kind in groups for axis, sign in PAIRS]
+    return write_lit(folder, np.concatenate(list(groups.values())), lights, mask=SCENE.mask, **{"camera": CAMERA, **changes})
 
 
 def solve(relit, folder, *arguments, code=0):

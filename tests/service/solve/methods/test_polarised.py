@@ -14,7 +14,7 @@ from stage.errors import ManifestError
 from stage.formats import exr
 from tests.reference import microfacet
 from tests.scenes import near_lights
-from tests.scenes.captures import angles_degrees, edit_manifest, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, edit_manifest, write_lit
 from tests.scenes.polarised import MATERIALS, polarised_scene, with_two_beckmann_lobes, write_plain, write_polarised
 
 SCENE = polarised_scene(size=28, lights=40)
@@ -165,17 +165,15 @@ def test_too_much_leak_is_said(tmp_path):
 def test_near_lights(tmp_path):
     """Glossy ripples under lamps at 1.3 radii: half rounding and the part not yet settled leave 0.1°."""
     dome = near_lights.dome(32)
-    view, f0, roughness, frames = np.array([0.0, 0.0, 1.0]), 0.05, 0.35, []
-    for index, lamp in enumerate(near_lights.lamps(dome, 48, 1.3)):
+    view, f0, roughness, images, lights = np.array([0.0, 0.0, 1.0]), 0.05, 0.35, [], []
+    for lamp in near_lights.lamps(dome, 48, 1.3):
         way = lamp.position - dome.points
         distance = np.linalg.norm(way, axis=-1, keepdims=True)
         half = near_lights.render(dome, lamp) / 2 * dome.mask[..., None]
         shine = microfacet.specular(dome.normal, way / distance, view, roughness**2, f0)[..., None] * lamp.strength / distance**2
-        for kind, image in (("cross", half), ("parallel", half + shine * dome.mask[..., None])):
-            write_exr(tmp_path / f"{index}_{kind}.exr", image)
-            frames.append({"image": f"{index}_{kind}.exr", "light": {**lamp.manifest(), "polarization": kind}})
-    write_image(tmp_path / "mask.png", (dome.mask * 255).astype(np.uint8))
-    write_manifest(tmp_path, {"schema": "relit.capture/1", "name": "near", "mask": "mask.png", "camera": dome.camera, "frames": frames})
+        images += half, half + shine * dome.mask[..., None]
+        lights += [{**lamp.manifest(), "polarization": kind} for kind in ("cross", "parallel")]
+    write_lit(tmp_path, images, lights, camera=dome.camera, mask=dome.mask)
     maps = solved(tmp_path)[0].maps
     assert angles_degrees(maps.normal, dome.normal)[dome.mask].mean() < 0.1
     assert np.median(np.abs(maps.diffuse_albedo.astype(float) / dome.albedo - 1)[dome.mask]) < 0.01

@@ -8,7 +8,7 @@ import pytest
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
 from tests.reference.sampling import lattice
-from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, distant, edit_frame, edit_manifest, write_image, write_lit
 
 LIGHTS, SIDE = 24, 40
 RNG = np.random.default_rng(5)
@@ -35,21 +35,13 @@ def surface(side: int, stretch: float) -> tuple[np.ndarray, np.ndarray]:
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True), mask
 
 
-def write(folder, normal, mask, albedo, *, shade=velvet, noise=0.0, **changes):
+def write(folder, normal, mask, albedo, *, shade=velvet, noise=0.0):
     radiance = shade(normal[mask])[..., None] * STRENGTH * albedo
     radiance = radiance * (1 + noise * np.random.default_rng(7).normal(size=radiance.shape))
-    frames = []
-    for index, direction in enumerate(DIRECTIONS):
-        image = np.zeros((*mask.shape, 3))
-        image[mask] = radiance[:, index]
-        write_exr(folder / f"{index:03d}.exr", image)
-        frames.append({"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction.tolist(),
-                                                             "irradiance": [1.0, 1.0, 1.0]}})
-    write_image(folder / "mask.png", (mask * 255).astype(np.uint8))
-    rows, cols = mask.shape
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "velvet", "mask": "mask.png", "frames": frames,
-                            "camera": {"projection": "orthographic", "resolution": [cols, rows]}, **changes})
-    return folder
+    images = np.zeros((LIGHTS, *mask.shape, 3))
+    images[:, mask] = radiance.swapaxes(0, 1)
+    return write_lit(folder, images, [distant(direction, 1.0) for direction in DIRECTIONS], mask=mask,
+                     camera={"projection": "orthographic", "resolution": list(mask.shape[::-1])})
 
 
 @pytest.fixture

@@ -164,7 +164,7 @@ export class OrbitScene {
 }
 
 /** Give back the memory of geometries, materials and textures. */
-export function release(root) {
+function release(root) {
   root.traverse((node) => {
     node.geometry?.dispose();
     for (const material of [node.material].flat()) {

@@ -2,7 +2,7 @@
 
 import { fetched } from "../api.js";
 
-export const CLIPPED = "srgb";
+const CLIPPED = "srgb";
 /** View transforms by name, in words. */
 export const VIEW_TRANSFORMS = { [CLIPPED]: "sRGB, clipped", aces: "ACES 2.0, 100 nits" };
 const TABLE = { side: 33, first: -12, stops: 19 }; // as docs/tools/view_table.py writes it

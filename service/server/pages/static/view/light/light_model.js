@@ -214,7 +214,7 @@ export class LightModel {
  * @param {Float32Array} colours [n, 3]
  * @param {number[]} weights [3]
  */
-export function addWeighted(found, colours, [red, green, blue]) {
+function addWeighted(found, colours, [red, green, blue]) {
   for (let at = 0; at < colours.length; at += 3) {
     found[at] += red * colours[at];
     found[at + 1] += green * colours[at + 1];

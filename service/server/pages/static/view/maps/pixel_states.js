@@ -1,6 +1,6 @@
 /** What is known of each pixel: solved, unsure (there is an estimate, which is not vouched for), refused (there is none), or outside. */
 
-export const SOLVED = 0;
+const SOLVED = 0;
 export const UNSURE = 1;
 export const REFUSED = 2;
 export const OUTSIDE = 3;
