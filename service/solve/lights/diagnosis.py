@@ -24,7 +24,7 @@ from service.light_estimation.lambertian import SHADOW, degrees_between, median_
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.lights.adapted import find_adapted
-from service.solve.lights.intensities import LEAST_GAIN
+from service.solve.lights.intensities import LEAST_GAIN as LEAST_ASKED
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.placement import find_placement
 from service.solve.lights.turn import find_turn
@@ -110,7 +110,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
                 raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
-        asked = estimated or solution.facts.get("light_intensities", {}).get("left_out_gain", 0.0) >= LEAST_GAIN
+        asked = estimated or solution.facts.get("light_intensities", {}).get("left_out_gain", 0.0) >= LEAST_ASKED
         if asked and not is_linear(capture.manifest.color_space):
             _hold_adapted(given, sample, solution)
         other = find_other_lights(given, lights) if found is None or found.cause is Cause.IRRADIANCE else None
