@@ -2,7 +2,10 @@
 
 Repeatability and reproducibility follow from the values by analysis of variance.
 
-Source: AIAG, Measurement Systems Analysis, 4th edition, 2010, chapter III, section B (ANOVA method).
+Sources:
+    AIAG, Measurement Systems Analysis, 4th edition, 2010, chapter III, section B (ANOVA method).
+    Burdick, Borror, Montgomery, "A review of methods for measurement systems capability analysis", Journal of Quality Technology 35(4),
+    2003 (bounds of the gauge, by modified large samples).
 """
 
 import json
@@ -11,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import fdtrc, fdtri
 from scipy.stats import chi2
 
 from service.boards.findings import six_digits
@@ -36,6 +39,10 @@ SPREAD = 6.0
 """Standard deviations that a tolerance is compared with."""
 NOISIER, CHANCE = 1.5, 0.001
 """The repeatability is said to be more than the inspections state where it is so many times that, and chance explains it this seldom."""
+SURE = 0.95
+"""Probability with which bounds hold."""
+LIMITS_PERCENT = (30, 10)
+"""Parts of a tolerance from which AIAG calls a gauge not acceptable, and up to which acceptable, per cent."""
 CATEGORIES = 1.41
 """√2, as AIAG rounds it: the number of distinct categories is this times part over gauge variation."""
 
@@ -56,11 +63,15 @@ class GaugeStudy(NamedTuple):
     total: float
     degrees_of_freedom: int
     """Degrees of freedom from which the repeatability is known."""
+    gauge_bound: float
+    """What the gauge is below with a probability of 95 %; with one operator, of its repeatability alone."""
+    gauge_percent_bound: float
+    """What %GRR is below with a probability of 95 %; with one operator, of the repeatability alone."""
 
     @property
     def repeatability_bound(self) -> float:
         """Return what the repeatability is below with a probability of 95 %, by the χ² distribution of its square."""
-        return self.repeatability * math.sqrt(self.degrees_of_freedom / float(chi2.ppf(0.05, self.degrees_of_freedom)))
+        return self.repeatability * math.sqrt(self.degrees_of_freedom / float(chi2.ppf(1 - SURE, self.degrees_of_freedom)))
 
     @property
     def gauge_percent(self) -> float:
@@ -76,6 +87,10 @@ class GaugeStudy(NamedTuple):
         """Return six standard deviations of the gauge over the width of a tolerance, per cent."""
         return 100 * SPREAD * self.gauge / width
 
+    def tolerance_percent_bound(self, width: float) -> float:
+        """Return what `tolerance_percent` is below with a probability of 95 %."""
+        return 100 * SPREAD * self.gauge_bound / width
+
 
 class GaugeBoardResult(NamedTuple):
     """The files and numbers of a study that was written."""
@@ -85,6 +100,8 @@ class GaugeBoardResult(NamedTuple):
     study: GaugeStudy
     tolerance_percent: float
     """Six standard deviations of the gauge over the narrowest tolerance of a region, per cent."""
+    tolerance_percent_bound: float
+    """What `tolerance_percent` is below with a probability of 95 %."""
     parts: int
     left_out: tuple[str, ...]
     """Regions of boards that not every run measured."""
@@ -133,6 +150,13 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
     if study.repeatability > NOISIER * noise > 0 and chi2.sf(freedom * (study.repeatability / noise) ** 2, freedom) < CHANCE:
         warnings.append(f"inspections of a board differ by {study.repeatability / noise:.2g} times the σ that they state: boards that are "
                         "named wrongly, that were moved or changed between runs, or a σ that is too small")
+    bound = study.tolerance_percent_bound(width)
+    crossed = next((limit for limit in LIMITS_PERCENT if percent < limit <= bound), None)
+    if crossed is not None:
+        operators = len({operator for _, operator in found})
+        warnings.append(f"the gauge takes {percent:.3g} % of the narrowest tolerance, but may take up to {bound:.3g} % (95 % sure): that "
+                        f"it takes less than {crossed} % is not known from {operators} operator{'s' * (operators > 1)} and {len(parts)} "
+                        "parts: measure by more operators, or more boards")
     timings.stage("write", 1)
     table_path, report_path = request.out / GAUGE_FILE, request.out / REPORT_FILE
     write_text(table_path, _table(parts))
@@ -140,13 +164,14 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
         request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
         study={"parts": len(parts), "operators": len({operator for _, operator in found}), "trials": parts[0].values.shape[1],
                **{f"{name}_m": None if value is None else six_digits(value) for name, value in study._asdict().items()
-                  if name != "degrees_of_freedom"},
+                  if name not in ("degrees_of_freedom", "gauge_percent_bound")},
                "repeatability_bound_m": six_digits(study.repeatability_bound), "degrees_of_freedom": study.degrees_of_freedom,
-               "gauge_percent": float(f"{study.gauge_percent:.4g}"),
-               "tolerance_percent": float(f"{percent:.4g}"), "narrowest_tolerance_m": width, "distinct_categories": study.categories,
+               "gauge_percent": float(f"{study.gauge_percent:.4g}"), "gauge_percent_bound": float(f"{study.gauge_percent_bound:.4g}"),
+               "tolerance_percent": float(f"{percent:.4g}"), "tolerance_percent_bound": float(f"{bound:.4g}"),
+               "narrowest_tolerance_m": width, "distinct_categories": study.categories,
                "stated_sigma_m": float(f"{noise:.4g}"), "left_out": left_out},
         warnings=warnings, timings_s=timings.close()))
-    return GaugeBoardResult(table_path, report_path, study, percent, len(parts), tuple(left_out), tuple(warnings), noise)
+    return GaugeBoardResult(table_path, report_path, study, percent, bound, len(parts), tuple(left_out), tuple(warnings), noise)
 
 
 def _regions(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -206,12 +231,14 @@ def gauge_study(values: np.ndarray) -> GaugeStudy:
     if operators == 1:
         repeat = error / freedom
         part = max((part_square - repeat) / trials, 0.0)
-        return _study(repeat, None, None, part, freedom)
+        times = part_square / (repeat * _f(parts - 1, freedom)) if repeat > 0 else math.inf
+        return _study(repeat, None, None, part, freedom, repeat * (1 + _rise(freedom)), (times - 1) / trials)
     operator_square = parts * trials * float(((by_operator - mean) ** 2).sum()) / (operators - 1)
     crossed = trials * float(((by_cell - by_part[:, None] - by_operator[None] + mean) ** 2).sum())
     crossed_freedom = (parts - 1) * (operators - 1)
     interaction: float | None = None
     repeat, base = error / freedom, crossed / crossed_freedom
+    bound, ratio = _bounds(values.shape, part_square, operator_square, base, repeat)
     if repeat == 0 or fdtrc(crossed_freedom, freedom, base / repeat) < POOL_PROBABILITY:
         interaction = max((base - repeat) / trials, 0.0)
     else:
@@ -219,10 +246,37 @@ def gauge_study(values: np.ndarray) -> GaugeStudy:
         repeat = base = (error + crossed) / freedom
     operator = max((operator_square - base) / (parts * trials), 0.0)
     part = max((part_square - base) / (operators * trials), 0.0)
-    return _study(repeat, operator + (interaction or 0.0), interaction, part, freedom)
+    return _study(repeat, operator + (interaction or 0.0), interaction, part, freedom, bound, ratio)
 
 
-def _study(repeat: float, operator: float | None, interaction: float | None, part: float, freedom: int) -> GaugeStudy:
+def _f(freedom: int, other: int) -> float:
+    """Return what an F-distributed ratio is below with the probability SURE."""
+    return float(fdtri(freedom, other, SURE))
+
+
+def _rise(freedom: int) -> float:
+    """Return by which part of its estimate a variance may be larger, with the probability SURE."""
+    return freedom / float(chi2.ppf(1 - SURE, freedom)) - 1
+
+
+def _bounds(shape: tuple[int, ...], part: float, operator: float, crossed: float, repeat: float) -> tuple[float, float]:
+    """Return the upper bound of the gauge's variance, and the lower bound of the variance of parts over it.
+    `shape`: parts, operators, trials. The others: mean squares of the study, with an interaction that is not pooled."""
+    parts, operators, trials = shape
+    terms = np.array([operator, (parts - 1) * crossed, parts * (trials - 1) * repeat])
+    rises = np.array([_rise(freedom) for freedom in (operators - 1, (parts - 1) * (operators - 1), parts * operators * (trials - 1))])
+    bound = float(terms.sum() + np.sqrt(((rises * terms) ** 2).sum())) / (parts * trials)
+    least = (parts - 1) / float(chi2.ppf(SURE, parts - 1))  # a mean square of parts is so many times its expectation at least
+    above = part - _f(parts - 1, (parts - 1) * (operators - 1)) * crossed
+    below = terms[1] + terms[2] + least * _f(parts - 1, operators - 1) * operator
+    return bound, parts * least * above / (operators * below) if below > 0 else math.inf
+
+
+def _study(repeat: float, operator: float | None, interaction: float | None, part: float, freedom: int, bound: float, ratio: float
+           ) -> GaugeStudy:
+    """Return a study of variances. `bound`: the most that the gauge's may be. `ratio`: the least that the parts' may be over it."""
     gauge, root = repeat + (operator or 0.0), math.sqrt
+    total = root(gauge + part)
+    most = max(100 / root(1 + max(ratio, 0.0)), 100 * root(gauge) / total if total > 0 else 0.0)
     return GaugeStudy(root(repeat), None if operator is None else root(operator), None if interaction is None else root(interaction),
-                      root(gauge), root(part), root(gauge + part), freedom)
+                      root(gauge), root(part), total, freedom, root(max(bound, gauge)), most)

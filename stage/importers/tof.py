@@ -23,6 +23,13 @@ MOST_TURN_M = 1e5
 MOST_BIN_M = 1e3
 """The longest bin of a histogram, 7 µs; cameras have bins below 10 m."""
 
+PEAK_SIGMAS, PEAK_FLOOR, PEAK_PART = 6.0, 0.3, 75
+"""Standard deviations by which a line of counts exceeds its floor where it has a pulse, the largest part of it that the floor is, and the
+percentile of its counts that the floor is: pulses are no longer than a quarter of a histogram."""
+PEAK_LEAD, TRIED_LINES = 0.3, 4096
+"""Part of the lines by which more must have a pulse along the other axis than along that of the bins, and number of lines that are looked
+at: rightly declared scenes, empty ones and ones with ambient light or retroreflectors too, lead by 0.12 at most."""
+
 
 class Plane(NamedTuple):
     """One correlation image."""
@@ -88,14 +95,14 @@ def import_correlations(
 
 
 def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s: float = 0.0, count_scale: float | None = None,
-                      pulses: int | None = None, first_photon_only: bool = False, bins: str = "last", arrays: ArrayFiles | None = None,
+                      pulses: int | None = None, first_photon_only: bool = False, bins: str | None = None, arrays: ArrayFiles | None = None,
                       source_m: Vector | None = None, view: View | None = None) -> Imported:
     """Write a capture.json for photon histograms; several files of one scene are frames that are added.
 
     Args:
         destination: the folder of the capture. .npy files of (rows, cols, bins) are placed there; other histograms are written as .npy.
         bin_s, start_s, count_scale, pulses, first_photon_only: as of `stage.capture.light.Pulsed`.
-        bins: `first` or `last`: where the bins are counted.
+        bins: `first` or `last`: where the bins are counted; None: last, unless the counts have their pulses along the first axis.
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.
     """
@@ -108,7 +115,7 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
     for name in names:
         for index, counts in enumerate(arrays.read(folder / name)):
             histograms = _histograms(folder / name, counts, bins, arrays.size)
-            if name.lower().endswith(".npy") and histograms.shape == counts.shape and bins == "last":
+            if name.lower().endswith(".npy") and histograms.shape == counts.shape and bins != "first":
                 shapes[name] = histograms.shape
                 continue
             target = f"{Path(name).stem}_histograms{index or ''}.npy"
@@ -183,10 +190,24 @@ def _counted(path: Path, shape: tuple[int, ...], planes: str | None, count: int)
     return fitting[0]
 
 
-def _histograms(path: Path, counts: np.ndarray, bins: str, size: tuple[int, int] | None) -> np.ndarray:
+def _peaked(counts: np.ndarray, axis: int) -> float:
+    """Return the part of the lines along an axis of [a, b, c] counts that have a pulse, as nearly all histograms of a scene do."""
+    lines = np.moveaxis(counts, axis, -1).reshape(-1, counts.shape[axis])
+    some = lines[::-(-len(lines) // TRIED_LINES)].astype(np.float64)
+    floor, top = np.percentile(some, PEAK_PART, axis=1), some.max(axis=1)
+    return float(((top > floor + PEAK_SIGMAS * np.sqrt(np.maximum(floor, 0) + 1)) & (floor < PEAK_FLOOR * top)).mean())
+
+
+def _histograms(path: Path, counts: np.ndarray, bins: str | None, size: tuple[int, int] | None) -> np.ndarray:
     """Return counts as (rows, cols, bins)."""
     if counts.ndim not in (2, 3) or counts.dtype.kind not in "fiub":
         raise ManifestError(f"{path}: is {' x '.join(map(str, counts.shape))} {counts.dtype}: give counts of (rows, cols, bins)")
+    if bins is None and counts.ndim == 3 and min(counts.shape[0], counts.shape[2]) >= LEAST_BINS:
+        first, last = _peaked(counts, 0), _peaked(counts, 2)
+        if first > last + PEAK_LEAD:
+            raise ManifestError(f"{path}: is {' x '.join(map(str, counts.shape))}, and {100 * first:.0f} % of its lines along the first "
+                                f"axis have a pulse, {100 * last:.0f} % of those along the last: say --bins first if bins are counted "
+                                "first, --bins last if they are not")
     counts = np.moveaxis(counts, 0, -1) if bins == "first" else counts
     if counts.ndim == 2:
         if size is None or size[0] * size[1] != len(counts):

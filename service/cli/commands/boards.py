@@ -90,6 +90,8 @@ def _gauge_board(result: "GaugeBoardResult") -> None:
     print("operator not measured: there is one" if study.reproducibility is None else f"operator {1e6 * study.reproducibility:.4g} µm")
     print(f"gauge    {1e6 * study.gauge:.4g} µm: {study.gauge_percent:.3g} % of the variation of {result.parts} parts, "
           f"{result.tolerance_percent:.3g} % of the narrowest tolerance (6 σ)")
+    print(f"sure     95 %: gauge below {1e6 * study.gauge_bound:.4g} µm, {study.gauge_percent_bound:.3g} % of the variation and "
+          f"{result.tolerance_percent_bound:.3g} % of the tolerance" + (", without operators" if study.reproducibility is None else ""))
     if result.left_out:
         print(f"left out {len(result.left_out)} regions that not every run measured: {', '.join(result.left_out[:5])}")
     print_warnings(result.warnings)

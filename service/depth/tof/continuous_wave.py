@@ -20,6 +20,7 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
+from service.depth.tof.inside_out import misread_shape
 from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, misread_direction, misread_frequencies, unfitting_images
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
@@ -152,9 +153,11 @@ of square waves, 11 %, bends phases by two thirds of it."""
 
 
 def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
-                       far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
+                       far_m: float | None, limit: float | None, usable: np.ndarray, rays: np.ndarray | None,
+                       device: str) -> RangeImage:
     """Return the range of each pixel from correlation images, of every pixel from which one can be decoded, however unsurely.
-    `near_m, far_m`: the span of ranges; None: 0, and as far as the frequencies tell apart. `limit`: saturation, in recorded values."""
+    `near_m, far_m`: the span of ranges; None: 0, and as far as the frequencies tell apart. `limit`: saturation, in recorded values.
+    `rays`: [rows, cols, 3] unit directions of the lines of sight; None where they are parallel."""
     rows, cols = usable.shape
     weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
     nearest = near_m or 0.0
@@ -208,7 +211,10 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     range_m = to_numpy(ranges.range)[:pixels].reshape(rows, cols)
     if wrong is None:
         amplitude = to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols)
-        wrong = misread_direction(range_m, amplitude, sure, nearest_m=nearest, repeat_m=repeat_m)
+        reversed_m = nearest + (-range_m - nearest) % repeat_m
+        wrong = misread_direction(range_m, reversed_m, amplitude, sure)
+        if wrong is None and rays is not None:
+            wrong = misread_shape(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m)
     if wrong is None:
         wrong = beyond_span(range_m, sure, nearest_m=nearest, repeat_m=repeat_m)
     if wrong is None:

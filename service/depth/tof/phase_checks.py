@@ -137,7 +137,7 @@ def _between(phase: np.ndarray, axis: int) -> np.ndarray:
     return (there - here + np.pi) % (2 * np.pi) - np.pi
 
 
-def misread_direction(range_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float) -> str | None:
+def misread_direction(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray) -> str | None:
     """Return that the phases look declared backwards, as a sentence; None if light does not fall off more rightly so.
 
     That surfaces grow brighter with the distance is not enough: the walls of a bowl do, and paint that is bright behind. If the phases run
@@ -147,16 +147,13 @@ def misread_direction(range_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarr
     distance.
 
     Args:
-        range_m: [rows, cols] metres.
+        range_m, reversed_m: [rows, cols] metres, as declared and if phases run backwards.
         amplitude: [rows, cols], in any unit.
         sure: [rows, cols] bool, pixels with a range.
-        nearest_m, repeat_m: the least range, and the distance after which all phases repeat.
     """
     rows, cols = range_m.shape
-    lit = sure & (amplitude > 0) & (range_m > 0)
-    backwards = nearest_m + (-range_m - nearest_m) % repeat_m
-    lit &= backwards > 0
-    near, far, bright = (np.log(np.where(lit, values, 1.0)) for values in (range_m, backwards, amplitude))
+    lit = sure & (amplitude > 0) & (range_m > 0) & (reversed_m > 0)
+    near, far, bright = (np.log(np.where(lit, values, 1.0)) for values in (range_m, reversed_m, amplitude))
     square, mixed, other, true_square, true_mixed, count = (np.zeros((BLOCKS, BLOCKS)) for _ in range(6))
     for axis in (0, 1):
         step, true_step, change = (np.subtract(*_ends(values, axis)) for values in (near, far, bright))

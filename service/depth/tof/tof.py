@@ -68,7 +68,7 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
             far_path_m = min(far_path_m, (near_path_m or 0.0) + common_range_m(correlations.modulation_hz, SPEED_OF_LIGHT))
         timings.stage("phases", 1)
         found = solve_correlations(correlations, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit, usable=mask,
-                                   device=device)
+                                   rays=_rays(capture.camera), device=device)
     found = _scattered(_corrected(found, options, calibration, path, near_m, far_m), mask)
     solved = np.isin(found.status, SOLVED) & mask.reshape(-1)
     shared = calibration.sigma_at(float(np.median(found.range_m[solved])) if solved.any() else calibration.middle_m)
@@ -149,6 +149,14 @@ def _depth_of(found: RangeImage, options: TofOptions, camera: Camera, mask: np.n
         warnings=list(found.warnings),
         facts=facts,
     )
+
+
+def _rays(camera: Camera) -> np.ndarray | None:
+    """Return the unit directions of the lines of sight, [rows, cols, 3] float64; None if they are parallel."""
+    if camera.projection == "orthographic":
+        return None
+    x, y = camera.plane_coordinates()
+    return np.stack([x, y, -np.ones_like(x)], axis=-1) * z_per_range(camera)[..., None]
 
 
 def z_per_range(camera: Camera) -> np.ndarray:

@@ -72,8 +72,8 @@ class HistogramImport(ArrayOptions, ImportRequest):
     """Laser pulses of each histogram, for pile-up."""
     first_photon_only: bool = False
     """The detector counts the first photon of a pulse alone: pile-up is corrected with `pulses`."""
-    bins: End = End.LAST
-    """The axis of the arrays along which the bins are counted."""
+    bins: End | None = None
+    """The axis of the arrays along which the bins are counted; None: the last, and arrays whose pulses run along the first are refused."""
 
 
 class KinectImport(CameraOptions, ImportRequest):

@@ -138,6 +138,28 @@ def test_histograms(relit, tmp_path, layout):
     tof = Capture.open(tmp_path).manifest.frames[0].tof
     assert (tof.bin_s, tof.count_scale) == (BIN_S, 10 if layout == "npy" else None)
 
+
+@pytest.mark.parametrize("retroreflectors", [0, 4])
+def test_bins_along_the_first_axis_are_refused_unless_it_is_said(relit, tmp_path, retroreflectors):
+    _, counts = histograms((20, 24))
+    counts.reshape(480, 128)[:retroreflectors] *= 30
+    np.save(tmp_path / "h.npy", np.moveaxis(counts, -1, 0))
+    relit("import", "histogram", tmp_path, "--bin-s", "1e-10").refused("--bins first if bins are counted first")
+    assert files_in(tmp_path) == {"h.npy"}
+    relit("import", "histogram", tmp_path, "--bin-s", "1e-10", "--bins", "last").well()
+
+
+@pytest.mark.parametrize("scene", ["lit floor", "dark"])
+def test_bins_along_the_last_axis_are_believed(relit, tmp_path, scene):
+    """A floor, each row of which is a pulse in bins of its own, under ambient light on half of the rows; and no return at all."""
+    mean = np.full((64, 24, 128), 0.5)
+    if scene == "lit floor":
+        mean[:32] = 40
+        mean[np.arange(64), :, 30 + np.arange(64)] += 200
+    np.save(tmp_path / "h.npy", RNG.poisson(mean).astype(np.int32))
+    assert "24x64 pixels of 128 bins" in relit("import", "histogram", tmp_path, "--bin-s", "1e-10").well()
+
+
 @pytest.mark.parametrize(("values", "words", "message"), [
     (np.ones((9, 64), np.int32), (), "h.npy: has 9 histograms of 64 bins in a row: say with --size"),
     (np.ones((9, 64), np.int32), ("--size", "2x4"), "has 9 histograms of 64 bins in a row"),

@@ -32,6 +32,20 @@ def painted():
     return tof.View(distance, 0.2 + 7 * (distance - 1.95), np.ones(distance.shape))
 
 
+def textured(*, curved):
+    """A corner of two walls, or a hollow about the camera, whose albedo is another one at every pixel."""
+    y, x = np.mgrid[0:ROWS, 0:COLS] + 0.5
+    ray = np.stack([(x - COLS / 2) / 90, (y - ROWS / 2) / 90, np.ones((ROWS, COLS))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    albedo = np.random.default_rng(5).uniform(0.1, 0.9, (ROWS, COLS))
+    if curved:  # a sphere of 0.9 m whose middle is 1.5 m away: bent as a plane is whose range is 2.5 m less its own
+        distance = 0.6 * ray[..., 2] + np.sqrt(0.9**2 - 0.6**2 * (1 - ray[..., 2] ** 2))
+        return tof.View(distance, albedo, ((distance[..., None] * ray - [0, 0, 0.6]) / 0.9 * ray).sum(axis=-1))
+    normals = np.array([[1, 0, 1], [-1, 0, 1]]) / np.sqrt(2)
+    cosine = (ray @ normals.T).max(axis=-1)
+    return tof.View(1.4 / cosine, albedo, cosine)
+
+
 def measured(folder, images, settings):
     """What relit depth makes of correlation images under these declarations."""
     write(folder, cw_frames(images, settings), camera={"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]})
@@ -50,6 +64,18 @@ def test_phases_that_are_declared_backwards_are_named(tmp_path, hz, phases):
     result = measured(tmp_path, images, [(f, -delta % (2 * np.pi)) for f, delta in settings])
     assert not result.maps.mask.any()
     assert "phases ran backwards" in result.warnings[0]
+
+
+@pytest.mark.parametrize("hz", [HZ, (60e6,)], ids=["three", "one"])
+def test_planes_with_texture_tell_that_phases_run_backwards(tmp_path, hz):
+    """The texture hides how brightness changes with the range: the planes bend as reversed planes do."""
+    settings = tof.even(hz, 4)
+    images = tof.correlations(textured(curved=False), 2e5, settings, ambient=30, seed=3)
+    right = measured(tmp_path / "right", images, settings)
+    assert not right.warnings and right.maps.mask.mean() > 0.95
+    result = measured(tmp_path / "backwards", images, [(f, -delta % (2 * np.pi)) for f, delta in settings])
+    assert not result.maps.mask.any()
+    assert "plane if the phases run backwards" in result.warnings[0]
 
 
 @pytest.mark.parametrize(("declared", "words"), [
@@ -84,7 +110,7 @@ def test_fog_is_not_believed(tmp_path):
     assert "as in fog" in result.warnings[0]
 
 
-@pytest.mark.parametrize("view", [bowl(), painted()], ids=["bowl", "painted"])
+@pytest.mark.parametrize("view", [bowl(), painted(), textured(curved=True)], ids=["bowl", "painted", "textured hollow"])
 @pytest.mark.parametrize("hz", [HZ, (60e6,)], ids=["three", "one"])
 def test_surfaces_that_grow_brighter_with_the_distance_are_believed(tmp_path, view, hz):
     """Light does not fall with the distances that they have if the phases run backwards."""
