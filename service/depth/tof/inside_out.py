@@ -58,7 +58,8 @@ def misread_shape(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.nda
                     for name in ("bends", "reversed_bends"))
     if area < LEAST_AREA or other < max(PLANES * area, TIMES * plane):
         return None
-    if not STEEPEST < sum(block.falls for block in blocks) / sum(block.far for block in blocks) < FLATTEST:
+    falls, far = sum(block.falls for block in blocks), sum(block.far for block in blocks)
+    if not STEEPEST * far < falls < FLATTEST * far:
         return None
     return (f"frames[].tof.reference_phase_rad: {100 * other / area:.0f} % of the surfaces are plane if the phases run backwards, and "
             f"{100 * plane / area:.0f} % as declared: check the order of the images, and the sign of reference_phase_rad; no range is "
