@@ -38,6 +38,7 @@ real objects, which are not quite Lambertian; errors of 5 % take away 0.5 to 0.8
 LEAST_APART, LEAST_GAIN_APART = 20, 0.2
 """Number of pixels that face otherwise than most (`Fit.apart`) from which on they must agree, and the least part of their cost that goes:
 of balls before glossy planes with right lights, none goes, while .4 to .8 of the cost of all pixels does."""
+UNEXPLAINED_APART = "others do not explain what faces otherwise than most of the object"
 TIMES_APART = 1.5
 """Most that they may leave of pixels that face otherwise than most, over what they leave of all: 1.1 on ten objects under wrong lights,
 and 2 to 6 of a ball before a glossy wall."""
@@ -89,6 +90,7 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     gain = 0.0
     declared = fit_lambertian(readings, usable, lights.direction)
     apart = declared.apart
+    judged_apart = apart.sum() >= LEAST_APART
     try:
         for fitted in (half, ~half):
             free, told = _factors(readings[:, fitted], usable[:, fitted], lights.direction, TRIAL_ROUNDS)
@@ -100,18 +102,18 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
             less = np.bincount(square, weights=cost[0] - cost[1 + chosen])
             if gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
                 return _declared(lights, "others explain left-out pixels hardly better", gain)
-            if apart.sum() >= LEAST_APART and cost[1 + chosen, apart].sum() > (1 - LEAST_GAIN_APART) * cost[0, apart].sum():
-                return _declared(lights, "others do not explain what faces otherwise than most of the object", gain)
+            if judged_apart and cost[1 + chosen, apart].sum() > (1 - LEAST_GAIN_APART) * cost[0, apart].sum():
+                return _declared(lights, UNEXPLAINED_APART, gain)
         factor = _factors(readings, usable, lights.direction, ROUNDS)[chosen]
     except CalibrationError as error:
         return _declared(lights, str(error))
-    fitted = fit_lambertian(readings / factor[:, None], usable, lights.direction)
-    after = fitted.misfit()
+    estimated = fit_lambertian(readings / factor[:, None], usable, lights.direction)
+    after = estimated.misfit()
     if not after <= LARGEST_LEFT:
         return _declared(lights, "no intensities explain the images by diffuse reflection", gain)
-    if apart.sum() >= LEAST_APART and fitted.misfit(apart) > max(TIMES_APART * after, NOISE):
-        return _declared(lights, "others do not explain what faces otherwise than most of the object", gain)
-    if fitted.apart.mean() < ROUND and not _told_by_relief(readings, usable, lights.direction, factor, after):
+    if judged_apart and estimated.misfit(apart) > max(TIMES_APART * after, NOISE):
+        return _declared(lights, UNEXPLAINED_APART, gain)
+    if estimated.apart.mean() < ROUND and not _told_by_relief(readings, usable, lights.direction, factor, after):
         return _declared(lights, "most of the object faces one way, where highlights look like lights of other strengths", gain)
     facts = {"used": "estimated", "left_out_gain": round(gain, 4), "misfit_declared": round(declared.misfit(), 4),
              "misfit_estimated": round(after, 4), "spread": round(float(np.log(factor).std()), 4), "factors": factor.round(4).tolist()}

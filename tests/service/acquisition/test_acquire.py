@@ -1,13 +1,11 @@
 """Whole captures without hardware: a serial board at a pseudo-terminal, HTTP, a person, and a camera that writes files."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,18 +19,16 @@ import pytest
 from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
-from service.cli.main import main
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
 from stage.errors import StageError
 from stage.importers.camera_options import View
-from tests.scenes.captures import make_scene, rgb, write_exr
+from tests.scenes.captures import make_scene, write_exr
 from tests.scenes.patched_rigs import write_plan
 from tests.service.answering import Asked, answering
 from tests.service.full_disk import files_of_at_most
 from tests.service.twin_program import ROOT
-from tests.service.waiting import until
 
 LAMPS = 6
 
@@ -302,46 +298,6 @@ def test_a_picture_that_is_there_is_taken_again_on_request(tmp_path, stage):
     check(tmp_path / "capture", stage, taken_twice=1)
     with pytest.raises(RequestError, match="its last one is 0007_light_006"):
         acquire(request(tmp_path, stage, rig, retake=("0009_light_008",)), ask)
-
-
-def be_the_program(words: list[str], said: Path) -> None:
-    """Run `relit` in this process, with its output in a file."""
-    with said.open("w") as file:
-        for stream in (1, 2):
-            os.dup2(file.fileno(), stream)
-    sys.argv = ["relit", *words]
-    main()
-
-
-@pytest.mark.long
-def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
-    stage, rounds, most = Stage(tmp_path / "watch"), 5, 3
-    write_plan(tmp_path, {"take": "dark"}, *[{"take": "olat"}] * rounds)
-    with controller(tmp_path, stage) as (rig, url):
-        given = request(tmp_path, stage, rig, trigger=posting(f"{url}/shoot"), timeout=10)
-        words = ["capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out", str(given.out), "--trigger", given.trigger,
-                 "--timeout", "10"]
-        random, processes = np.random.default_rng(2), multiprocessing.get_context("forkserver")  # which loads all modules once
-        processes.set_forkserver_preload(["service.cli.commands.acquire", "service.acquisition.acquire", "service.acquisition.early_ingest",
-                                          "service.acquisition.cameras.watched_folder", "service.acquisition.lights.http_requests"])
-        for _ in range(10):
-            wanted = stage.released + int(random.integers(1, most + 1))  # the first shows that nothing moved
-            program = processes.Process(target=be_the_program, args=[words, tmp_path / "said.txt"])
-            program.start()
-            until(lambda program=program, wanted=wanted: stage.released >= wanted or not program.is_alive(), "no picture", every_s=0.001)
-            time.sleep(random.uniform(0, 0.1))
-            assert program.is_alive(), f"the capture ended before it was killed: {(tmp_path / 'said.txt').read_text()}"
-            program.kill()
-            program.join()
-        last = processes.Process(target=be_the_program, args=[words, tmp_path / "said.txt"])
-        last.start()
-        last.join()
-        assert last.exitcode == 0, (tmp_path / "said.txt").read_text()
-    assert stage.on == set()
-    check(tmp_path / "capture", stage, rounds=rounds)
-    assert not list((tmp_path / "capture").glob(".*.exr"))  # half-written when it was killed
-    seen = [rgb(path) for path in sorted((tmp_path / "capture").glob("*_light_*.exr"))]  # and each picture is that of its lamp
-    assert [np.abs(0.2 * stage.scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == rounds * list(range(LAMPS))
 
 
 def test_bad_input_is_refused_with_one_sentence(tmp_path, stage):

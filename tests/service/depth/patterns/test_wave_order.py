@@ -41,7 +41,8 @@ def test_right_orders_and_other_faults_raise_no_doubt_of_the_order(name, gamma):
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 @pytest.mark.parametrize("name", ["one", "one of eight", "three"])
 def test_exchanged_steps_are_named(name, gamma):
-    """Of four steps, 1 and 2 exchanged are 0 and 3 exchanged, backwards: both are named. Of eight, one exchange is the only one."""
+    """Four steps whose 1 and 2 are exchanged are the same waves, run backwards, as those whose 0 and 3 are: the sentence names both
+    exchanges. Among eight steps one exchange alone fits."""
     patterns = patterns_of(name)
     declared = changed(patterns, step=lambda pattern: {1: 2, 2: 1}.get(pattern.step, pattern.step))
     found = order_said(frames_of(patterns, gamma=gamma), declared)
