@@ -133,11 +133,12 @@ def _rig(folder: Folder, fits: Callable[[tuple[int, int]], bool], told: str) -> 
         matrices = arrays_of(path)
         if not set(PROJECTOR_MATRIX) & set(matrices):
             continue
-        size = projector_size(path) or _centred(matrices, [size for size in PROJECTORS if fits(size)])
+        said = projector_size(path)
+        size = said or _centred(matrices, [size for size in PROJECTORS if fits(size)])
         moved = next((matrices[name] for name in ("T", "Tp", "trans", "translation") if name in matrices), None)
         metres = moved is not None and float(np.linalg.norm(moved)) < METRES
         if size is not None and fits(size):
-            middle = () if projector_size(path) is not None else (
+            middle = () if said is not None else (
                 f"the projector has {size[0]}x{size[1]} pixels: these have as many bits, and {path.name} has its principal point near the "
                 "middle of their columns",)
             return (["--projector", f"{size[0]}x{size[1]}", "--calibration", path, "--unit-m", "1" if metres else "0.001"],

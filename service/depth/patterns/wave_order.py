@@ -82,7 +82,7 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
     exchanges = len(found)
     taken = np.argsort(np.argsort(roles))  # place of each frame in the sequence
     across = declared.reshape(steps, len(waves)).T
-    words = ("all {} come before the next {}: check the order of the images (--order axis,{} of relit import phase)")
+    words = "all {} come before the next {}: check the order of the images (--order axis,{} of relit import phase)"
     if len(waves) > 1 and (taken == declared.ravel()).all():
         found.append((left(across), words.format("periods of one step", "step", "step,period")))
     elif len(waves) > 1 and (taken == across.ravel()).all():
