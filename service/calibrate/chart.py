@@ -109,7 +109,8 @@ def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> 
     timings.close()
     corners = corners[turned]
     written, unseen = _corrected(source, target, found)
-    warnings = (*_stance(corners), *(finding for each in found for finding in _findings(each, len(found), manifest)), *unseen)
+    warnings = (*_stance(corners), *(finding for each in found for finding in _findings(each, len(found), manifest)), *unseen,
+                *source.doubts)
     shown = [(each.kind.words(manifest) if len(found) > 1 else "corrected", each.colors) for each in found]
     picture = write_picture(manifest_path.parent / PICTURE_FILE, mean, corners, chart, shown, space, request.review)
     report = write_results("chart", request, written, manifest_path, {

@@ -111,6 +111,7 @@ def write_lights(
     warnings: Sequence[str] = (),  # what there is to say of all lights
 ) -> LightCalibration:
     """Write the report, then the manifest, each whole or not at all, and return what was written."""
+    warnings = [*warnings, *captures.source.doubts]
     manifest = with_lights(captures.target, [result.light for result in results])
     if relative is not None:
         manifest = manifest.model_copy(update={"irradiance_scale": "relative" if relative else "absolute"})
@@ -122,12 +123,12 @@ def write_lights(
     flagged = sum(bool(result.entry["flags"]) for _, result in measured)
     report = write_results(kind, request, manifest, captures.manifest_path, {
         "capture": str(captures.source.folder), "applied_to": str(captures.target.folder),
-        "measured": len(measured), "dropped": dropped, "flagged": flagged, "warnings": list(warnings), **summary, "lights": lights})
+        "measured": len(measured), "dropped": dropped, "flagged": flagged, "warnings": warnings, **summary, "lights": lights})
     measured.sort(key=lambda pair: pair[1].doubt, reverse=True)
     rows = [(lit.frame.image, *result.row, ", ".join(result.entry["flags"])) for lit, result in measured]
     counts = (len(measured), "measured"), (dropped, "left out"), (flagged, "flagged")
     text = ", ".join(f"{count} {what}" for count, what in counts if count)
-    return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text, list(warnings))
+    return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text, warnings)
 
 
 def write_results(kind: str, request: Options, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:

@@ -54,6 +54,7 @@ class RigCalibration(NamedTuple):
     headings: tuple[str, ...]
     rows: list[tuple[str, ...]]
     summary: str
+    warnings: tuple[str, ...]
 
 
 class Shot(NamedTuple):
@@ -134,7 +135,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
     report = write_report("rig", request, request.out.parent, {
         "capture": str(capture.folder), "rig": str(request.rig), "measured": len(measured), "left": len(errors) + len(missing),
         "flagged": flagged, "irradiance_scale": "absolute" if _absolute(request) else "relative", "color_space": space,
-        "dark_frames": len(sweep.dark), **target.entry, "primaries": entries})
+        "dark_frames": len(sweep.dark), **target.entry, "warnings": capture.doubts, "primaries": entries})
     write_rig(result, request.out)
     if target.chart is not None:
         _write_chart(request.out.parent / CHART_FILE, target.chart, result, patches)
@@ -144,7 +145,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
         for entry in sorted((entry for entry in entries if "irradiance" in entry), key=lambda each: -float(each["relative_sigma"]))]
     counts = (len(measured), "measured"), (len(errors) + len(missing), "left as they were"), (flagged, "flagged")
     return RigCalibration(request.out, report, ("primary", "irradiance", "sure to", "response", "flags"), rows,
-                          ", ".join(f"{count} {what}" for count, what in counts if count))
+                          ", ".join(f"{count} {what}" for count, what in counts if count), capture.doubts)
 
 
 def _read_table(path: Path, capture: Capture, rig: Rig) -> Sweep:

@@ -134,6 +134,7 @@ def _rig(result: Any) -> None:
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
+    print_warnings(result.warnings)
 
 
 def _print_files(manifest_paths: Iterable[Path], report_path: Path) -> None:
