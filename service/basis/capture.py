@@ -13,6 +13,7 @@ from kernels import packs
 from kernels.packs import Band
 from kernels.relight.basis.rti import encode
 from service.errors import RequestError
+from service.light_estimation.declared_lights import declared_light_sentences
 from service.relight.clipping import Clipping
 from service.relight.findings import LEAST_CLIPPED, clipped_sentence
 from service.reporting.progress import Timings
@@ -114,7 +115,8 @@ def open_capture(request: BasisRequest | PublishRequest, timings: Timings) -> Ba
     provenance = metadata(request, capture=capture.name, inputs=stack.key, near_lights=near)
     clipping = Clipping.of(stack, inside[: stack.pixel_count])
     shares = clipping.share(np.broadcast_to(stack.scale, (1, 3, len(stack.scale))))[0]
-    warnings = (clipped_sentence(shares, clipping.pixels, "the picture under all lights"),) if shares.max() >= LEAST_CLIPPED else ()
+    clipped = [clipped_sentence(shares, clipping.pixels, "the picture under all lights")] if shares.max() >= LEAST_CLIPPED else []
+    warnings = (*capture.doubts, *declared_light_sentences(stack, capture, lights, mask), *clipped)
     return BasisCapture(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance, warnings)
 
 

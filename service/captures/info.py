@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.dark_lights import dark_lights, dark_sentence
+from service.light_estimation.declared_lights import facing_sentence
 from service.light_estimation.explanations import (
     MIN_LIGHTS,
     PIXELS,
@@ -313,11 +314,13 @@ def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.
     usable = np.stack([(recorded[frame.image] < np.float32(most)).all(axis=-1) for (frame, _), most in zip(lit, limits, strict=True)])
     sample = Sample(radiance, usable, np.array([light.direction for _, light in lit]), np.array([light.irradiance for _, light in lit]),
                     np.array([frame.exposure_s or 1.0 for frame, _ in lit]), capture.manifest.color_space)
+    fit = fit_manifest(sample)
+    if (away := facing_sentence(fit)) is not None:
+        return Findings([away], {})
     dark = dark_lights(grey_readings(radiance, sample.irradiance), sample.directions)
     if dark.any():
         images = [frame.image for frame, _ in lit]
         return Findings([dark_sentence(images, dark, "take them again, or out of the frames; a solve leaves them out")], {})
-    fit = fit_manifest(sample)
     if (found := better_explanation(sample, fit)) is not None:
         return Findings([explanation_sentence(found, sample)], {})
     off = _suspects(sample, fit)

@@ -36,6 +36,19 @@ SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
 """A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
 lights."""
 
+FACING, FACING_INSTEAD = 0.8, 0.83
+"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes: 0.85 of objects
+with metal parts. Bare metal, whose Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
+
+
+class ViewAxis(NamedTuple):
+    """An axis of the lights that looks like the one towards the camera."""
+
+    axis: int
+    sign: int
+    share: float
+    """The part of the pixels whose normal faces along it."""
+
 
 class Fit(NamedTuple):
     """b = level · normal of each pixel, and what it leaves."""
@@ -53,6 +66,15 @@ class Fit(NamedTuple):
     def facing(self) -> float:
         """The part of the pixels whose normal has z > 0, as every visible surface has."""
         return float((self.vector[2] > 0).mean())
+
+    @property
+    def towards_camera(self) -> ViewAxis | None:
+        """The axis along which visible surfaces face where it is not z, as where directions are negated or axes exchanged; else None."""
+        if self.facing >= FACING:
+            return None
+        found = max((ViewAxis(axis, sign, float((sign * self.vector[axis] > 0).mean())) for axis in (2, 1, 0) for sign in (1, -1)),
+                    key=lambda each: each.share)
+        return found if found.share >= FACING_INSTEAD else None
 
     @property
     def spare(self) -> np.ndarray:

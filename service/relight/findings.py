@@ -71,6 +71,12 @@ class FrameFindings:
         if sentence is not None and sentence not in self.doubts:
             self.doubts.append(sentence)
 
+    def add_field(self, sentence: str) -> None:
+        """Take in what contradicts a field of the manifest; of a sequence once, because its numbers differ from step to step."""
+        name = sentence.split(":", 1)[0]
+        if name == "frames" or not any(doubt.startswith(f"{name}:") for doubt in self.doubts):  # frames: those of a step are named
+            self.add_doubt(sentence)
+
     @property
     def sentences(self) -> tuple[str, ...]:
         """Return sentences that say what does not fit, and what to try."""

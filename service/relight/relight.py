@@ -13,7 +13,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.images import ImagesOnDevice
-from service.light_estimation.dark_lights import dark_frames, dark_sentence
+from service.light_estimation.declared_lights import declared_light_sentences
 from service.relight.attributes import time_attributes
 from service.relight.clipping import Clipping
 from service.relight.combine import chunk_frames, linear_frames, row_blocks
@@ -147,8 +147,8 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
                                opened.capture.sources(), opened.lights)
         mask = opened.capture.mask()
         clipping = Clipping.of(stack, mask.reshape(-1))
-        if (dark := dark_frames(stack, opened.lights, mask)).any():
-            findings.add_doubt(dark_sentence(stack.frames, dark, "light from there is missing; take them again, or out of the frames"))
+        for sentence in declared_light_sentences(stack, opened.capture, opened.lights, mask):
+            findings.add_field(sentence)
     with timings.part("matte"):
         matte = frame_matte(request, opened.capture, stack)
         mattes.add(matte)

@@ -11,6 +11,7 @@ import numpy as np
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
+from service.light_estimation.declared_lights import sample_of
 from service.light_estimation.explanations import (
     PIXELS,
     Cause,
@@ -99,7 +100,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     if isinstance(lights, DistantLights):
         assert isinstance(declared, DistantLights)
         solution.suspects = suspect_lights(solution, given.stack, pad_lights(declared.direction, declared.irradiance, given.stack.scale))
-        sample = _sample(given, capture, declared)
+        sample = sample_of(given.stack, capture, declared, given.mask)
         fit = fit_manifest(sample)
         found = better_explanation(sample, fit)
         estimated = lights is not declared
@@ -158,15 +159,6 @@ def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None
                              f"place of lights of other strengths, which turns normals by {np.median(turned):.2g}°: give images without; "
                              "sigma holds that")
     raise_error(solution, at_all_pixels(given.mask, chosen, turned))
-
-
-def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
-    stack = given.stack
-    inside = np.flatnonzero(given.mask)
-    radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
-    times = {frame.image: frame.exposure_s or 1.0 for frame in capture.sources()}
-    exposure = np.array([times[image] for image in stack.frames])
-    return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
 
 
 def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:

@@ -15,7 +15,7 @@ from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import Fit, degrees_between, fit_lambertian, median_of
+from service.light_estimation.lambertian import FACING, Fit, degrees_between, fit_lambertian, median_of
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.lights.axes import Axes, sites, wrong_axes
 from service.solve.lights.object_outline import EDGE, Outline, cast_shadows, outline
@@ -24,9 +24,6 @@ from stage.capture.point_lights import DistantLights
 
 MAP_SIZE, FIT_SIZE = 120, 64
 """Pixels across the small map on which the outline and shadows are compared, and of the one whose readings are fitted anew."""
-FACING, FACING_INSTEAD = 0.8, 0.83
-"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes: 0.85 of objects
-with metal parts. Bare metal, whose Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
 LEAST_LIGHTS = 4
 """Fewer lights may lie almost in a plane, and then most normals of noise face away."""
 CLEAR, CLEAR_PART = 0.4, 0.8
@@ -150,10 +147,9 @@ def _is_inverted(shadows: "_Shadows", edge: Outline, lights: int) -> bool | None
 
 def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes | None:
     """Return the signed axis that is the view axis, when most normals face away, and what then is wrong in the image plane."""
-    shares = {(axis, sign): float((sign * fit.vector[axis] > 0).mean()) for axis in (2, 1, 0) for sign in (1, -1)}
-    (axis, sign), share = max(shares.items(), key=lambda item: item[1])
-    if share < FACING_INSTEAD:
+    if fit.towards_camera is None:
         return None
+    axis, sign, share = fit.towards_camera
     exchange = np.eye(3)
     exchange[[2, axis]] = exchange[[axis, 2]]
     exchange[2] *= sign

@@ -1,0 +1,48 @@
+"""What frames, bases and `relit info` say of lights that are declared wrongly; right ones leave nothing to say."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.basis.basis import make_basis
+from service.captures.info import inspect
+from service.relight.relight import relight
+from service.requests.basis import BasisRequest
+from service.requests.captures import InfoRequest
+from service.requests.relight import RelightRequest
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr
+
+SCENE = make_scene(size=32, lights=12)
+AXES = {"x": np.eye(3)[[2, 1, 0]], "y": np.eye(3)[[0, 2, 1]], "-z": -np.eye(3)}
+"""What the true directions are multiplied by, by the axis that then looks like the one towards the camera."""
+
+
+def declared(folder, change):
+    """Write the capture with other directions, and return what is said of its lights by info, frames and a basis."""
+    write_capture(folder, SCENE)
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    for frame, direction in zip(frames, change(SCENE.directions), strict=True):
+        frame["light"]["direction"] = direction.tolist()
+    edit_manifest(folder, frames=frames)
+    write_exr(folder.parent / "sky.exr", np.full((16, 32, 3), 0.3, np.float32))
+    frame = relight(RelightRequest(capture=folder, environment=str(folder.parent / "sky.exr"), out=str(folder.parent / "frame.#.exr"),
+                                   device="cpu"))
+    basis = make_basis(BasisRequest(capture=folder, out=folder.parent / "basis.exr", device="cpu"))
+    return [[each for each in said if each.startswith("frames[].light")]
+            for said in (inspect(InfoRequest(capture=folder)).findings, frame.warnings, basis.warnings)]
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_axes_along_which_nothing_faces_the_camera_are_named(tmp_path, axis):
+    for said in declared(tmp_path / "capture", lambda directions: directions @ AXES[axis]):
+        assert len(said) == 1 and f"with {axis} as the axis towards the camera, 100 % face it" in said[0]
+
+
+def test_lights_in_another_order_are_named(tmp_path):
+    for said in declared(tmp_path / "capture", lambda directions: np.random.default_rng(0).permutation(directions)):
+        assert len(said) == 1 and "images and directions do not belong together" in said[0]
+
+
+def test_right_lights_leave_nothing_to_say(tmp_path):
+    assert declared(tmp_path / "capture", lambda directions: directions) == [[], [], []]
