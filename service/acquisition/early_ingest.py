@@ -8,11 +8,13 @@ import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from kernels.status import ESTIMATED
 from service.acquisition.plans.shots import Shot
+from service.light_estimation.declared_lights import declared_light_sentences
 from service.relight.relight import relight
 from service.relight.sheet import AS_EVER, BACKGROUND, display, exposure_of, fit, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
@@ -21,6 +23,7 @@ from service.requests.solve import Intensities, Method, SolveRequest
 from service.solve.opening import open_solve
 from stage.capture.capture import Capture, source_places
 from stage.capture.manifest import FILE_NAME, read_manifest
+from stage.capture.point_lights import DistantLights
 from stage.colour.colour_spaces import Review
 from stage.errors import StageError
 from stage.stack.early import EarlyStack
@@ -92,8 +95,16 @@ class EarlyIngest:
                 self._stopped = True
 
 
-def write_preview(capture: Path, device: str | None, progress: Progress | None = None, *, review: Review = AS_EVER) -> Path:
-    """Write preview.png into the folder of a capture, and return its path.
+class Preview(NamedTuple):
+    """The preview of a capture that has just been taken."""
+
+    path: Path
+    warnings: tuple[str, ...]
+    """What all pictures together say against the lights of the rig, or the exposures: none of them shows it alone."""
+
+
+def write_preview(capture: Path, device: str | None, progress: Progress | None = None, *, review: Review = AS_EVER) -> Preview:
+    """Write preview.png into the folder of a capture.
 
     Normals are those of least squares on the lights in neither shadow nor highlight, without the judgement of a solve, its height and its
     material; the images are put into the stack that a solve reads after it. Raises RequestError, StageError or KernelError if the capture
@@ -115,4 +126,6 @@ def write_preview(capture: Path, device: str | None, progress: Progress | None =
     path = capture / PREVIEW_FILE
     shown = display(relit * exposure_of(relit[None], seen), space, review)
     write_sheet(path, [[("normals", fit(normals, rows, kernel="triangle")), ("relit from above left", shown)]], height=rows)
-    return path
+    said = declared_light_sentences(opened.given.stack, opened.capture, opened.lights, opened.given.mask) if isinstance(
+        opened.lights, DistantLights) else []
+    return Preview(path, (*opened.capture.doubts, *said))

@@ -111,7 +111,9 @@ def _preview(request: AcquireRequest, taken: int) -> None:
     if taken == 0 and request.review == AS_EVER and (request.out / PREVIEW_FILE).exists():
         return
     try:
-        print(f"preview  {write_preview(request.out, request.device, review=request.review)}", flush=True)
+        made = write_preview(request.out, request.device, review=request.review)
+        print(f"preview  {made.path}", flush=True)
+        print_warnings(made.warnings)
     except USER_ERRORS as error:
         print(f"preview  none: {sentence(error)}", flush=True)
 

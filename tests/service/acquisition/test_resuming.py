@@ -185,13 +185,22 @@ def stage(tmp_path, monkeypatch):
 
 def test_the_preview_shows_the_normals_of_the_capture(tmp_path):
     scene = make_scene(size=64, lights=8)
-    path = write_preview(write_capture(tmp_path / "capture", scene), "cpu")
-    shown = images.read_pixels(path).astype(np.float64)[MARGIN + TITLE:, MARGIN:]
+    made = write_preview(write_capture(tmp_path / "capture", scene), "cpu")
+    assert made.warnings == ()
+    shown = images.read_pixels(made.path).astype(np.float64)[MARGIN + TITLE:, MARGIN:]
     normals = 2 * shown[:64, :64] - 1
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     degrees = np.degrees(np.arccos(np.clip((normals * scene.normal).sum(axis=-1), -1, 1)))[scene.mask]
     assert degrees.max() < EIGHT_BITS_DEGREES
     assert np.abs(shown[:64, :64][~scene.mask]).max() < 0.1  # the background
+
+
+def test_an_exposure_that_changes_on_the_way_is_said_with_the_preview(tmp_path):
+    """Half as much light under every other lamp of a ring, as where they are taken first, and the others after them."""
+    scene = make_scene(size=64, lights=16)
+    images_taken = scene.images * np.where(np.arange(16) % 2, 1, 0.5)[:, None, None, None]
+    (warning,) = write_preview(write_capture(tmp_path / "capture", scene._replace(images=images_taken)), "cpu").warnings
+    assert warning.startswith("frames[].light.irradiance: it is missing or wrong") and "exposure" in warning
 
 
 def arguments(folder, stage, rig) -> list:
