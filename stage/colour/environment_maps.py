@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stage.colour.colour import convert
+from stage.colour.colour import convert, linearise
+from stage.colour.colour_spaces import is_linear
 from stage.colour.radiance import CLIP_NEGATIVE, check_finite, check_radiance, clip_negative
 from stage.errors import ImageError
 from stage.formats import exr, images
@@ -16,6 +17,27 @@ LEAST_FULL = 0.01
 """Part of light, from texels at the largest half value, from which on it is said."""
 LEAST_OUTSIDE = 0.01
 """Part of light, added by colours outside of a space, from which on it is said."""
+
+LOOKED_AT, LEAST_CODES = 256, 32
+"""Rows and columns of a map that are looked at, and least count of their different values, for 8 bits to be told: maps that are drawn have
+few values, and those of other maps are not all within the rounding of half floats of such codes, which hits each by chance one in four."""
+HALF_ROUNDING = 2.0**-11
+
+
+def eight_bit_sentence(name: str, pixels: np.ndarray, space: str) -> str | None:
+    """Return a sentence about an EXR map all of whose values are those of an image of 8 bits, or None.
+    `pixels`: [rows, cols, 3] as recorded. `space`: the colour space in which they are taken."""
+    values = np.unique(pixels[:: -(-pixels.shape[0] // LOOKED_AT), :: -(-pixels.shape[1] // LOOKED_AT)])
+    if not LEAST_CODES <= len(values) <= 256 or not 0 <= values[0] <= values[-1] <= 1 + HALF_ROUNDING:
+        return None
+    codes = np.arange(256, dtype=np.float32) / 255
+    for encoded, levels in ((True, codes), (False, linearise(np.repeat(codes[:, None, None], 3, axis=2), "srgb_texture")[:, 0, 0])):
+        if (np.abs(values[:, None] - levels).min(axis=1) <= HALF_ROUNDING * values + 1e-6).all():
+            wrong = encoded and is_linear(space)
+            taken = ", and they look display-encoded and are taken as linear: dark parts are too bright" if wrong else ""
+            return (f"environment {name}: all its values are those of an image of 8 bits{taken}; what was brighter than white is clipped, "
+                    "so that a sun or lamps in it are too dark: give a map of high dynamic range in linear light")
+    return None
 
 
 def full_sentences(full: Mapping[str, float]) -> list[str]:
@@ -59,13 +81,14 @@ def check_environment(path: Path) -> None:
 
 
 def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None,
-                     outside: dict[str, float] | None = None, full: dict[str, float] | None = None) -> np.ndarray:
+                     outside: dict[str, float] | None = None, full: dict[str, float] | None = None,
+                     eight_bit: dict[str, str] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
     `path`: lat-long .exr or .hdr. `space`: the scene-linear colour space of the result. `clipped`: is given the number of pixels with
     values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. `outside`: is given the
     part of its light that colours outside of the gamut of `space` gain, 0 or above. `full`: is given the part of its light that texels at
-    the largest half value hold, if it is EXR. Returns [rows, cols, 3] float32, scene-linear, none of
-    them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is 0."""
+    the largest half value hold, if it is EXR. `eight_bit`: is given the sentence of a map of 8 bits. Returns [rows, cols, 3] float32,
+    scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is 0."""
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:
         check_radiance(path, pixels, remedy=CLIP_NEGATIVE)
@@ -78,6 +101,8 @@ def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None =
         converted = convert(pixels, given, space)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
+    if eight_bit is not None and (said := eight_bit_sentence(path.name, pixels, given)) is not None:
+        eight_bit[path.name] = said
     shown = np.maximum(converted, 0)
     height = np.sin(np.pi * (np.arange(len(shown)) + 0.5) / len(shown))
     if full is not None and path.suffix.lower() == ".exr" and (at_end := (pixels == exr.HALF_MAX).any(axis=-1)).any():

@@ -52,3 +52,23 @@ def test_radiance_maps_that_were_multiplied_are_said(tmp_path, factors, words):
         write_radiance(tmp_path / f"sky.{number}.hdr", np.full((16, 32, 3), float(factor)), f"EXPOSURE={factor}")
         assert (environments.read(environments.path(number), REC709).radiance == factor).all()
     assert [words in each for each in environments.doubts()] == ([] if words is None else [True])
+
+
+@pytest.mark.parametrize(("encoded", "dtype"), [(True, np.float16), (True, np.float32), (False, np.float16), (False, np.float32)])
+def test_maps_of_8_bits_are_said(tmp_path, encoded, dtype):
+    """A sky of 8 bits as it is recorded, or decoded by the formula of IEC 61966-2-1."""
+    codes = np.random.default_rng(2).integers(0, 256, (32, 64, 3)) / 255
+    light = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    for space, said in ((REC709, [encoded]), ("srgb_texture", [False])):
+        environments = Environments(write_exr(tmp_path / "sky.exr", codes if encoded else light, dtype, colorInteropID=space))
+        environments.read(tmp_path / "sky.exr", REC709)
+        assert ["display-encoded" in each for each in environments.doubts() if "8 bits" in each] == said
+
+
+def test_other_maps_are_not_of_8_bits(tmp_path):
+    """Light of any value below 1; a drawn map of few values."""
+    light = np.random.default_rng(3).uniform(0, 1, (32, 64, 3))
+    for radiance in (light, light + 0.5, np.round(3 * light) / 3):
+        environments = Environments(write_exr(tmp_path / "sky.exr", radiance, np.float16))
+        environments.read(tmp_path / "sky.exr", REC709)
+        assert environments.doubts() == []
