@@ -31,6 +31,7 @@ from stage.colour.colour import convert
 from stage.colour.environment_maps import check_environment, outside_sentences
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError
+from stage.folders import advice
 from stage.formats.ply import POINTS_FILE, PointCloud, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.maps import MAPS_FILE, SurfaceMaps
@@ -80,7 +81,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     depth = request.maps / DEPTH_FILE if request.maps.is_dir() else request.maps
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
     if not of_depth and not path.exists():
-        raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
+        raise ResultError(f"{path}: is not there: {advice(request.maps, 'run `relit solve` or `relit depth` first', of_result=True)}")
     if of_depth or not writer.variants:
         _refuse_surroundings(request)
     if of_depth:

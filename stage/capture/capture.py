@@ -10,10 +10,11 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, Light, OffLight, PointLight
-from stage.capture.manifest import FILE_NAME, Frame, Manifest, read_manifest
+from stage.capture.manifest import FILE_NAME, LIT_BY, Frame, Manifest, read_manifest
 from stage.colour import radiance as radiances
 from stage.colour.colour_spaces import is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
+from stage.folders import advice
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.formats.exif import Exposure, check_agreement, exposure_times, multiplied_otherwise, unused_exposures
@@ -74,7 +75,8 @@ class Capture:
             if not folder.is_dir():
                 raise ManifestError(f"{folder}: there is no such folder")
             if not (folder / FILE_NAME).exists():
-                raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
+                advised = advice(folder, "see `relit import` for data laid out another way")
+                raise ManifestError(f"{folder}: holds no {FILE_NAME}: {advised}")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         headers = capture._check_files()
         capture = capture._exposed(headers)
@@ -142,6 +144,12 @@ class Capture:
         """
         frames = self.manifest.frames
         return [frames[index] for index in source_places([frame.light for frame in frames])]
+
+    def none_is_lit(self, by: str) -> str:
+        """Return the sentence for a capture without a frame that is lit `by` what is asked for; it names the command for other frames."""
+        kinds = [kind for kind in LIT_BY if kind != "light" and any(getattr(frame, kind) is not None for frame in self.manifest.frames)]
+        other = f": frames with {' and '.join(kinds)} are for relit depth" if kinds else ""
+        return f"{self.folder / FILE_NAME}: frames: none is lit by {by}{other}"
 
     @property
     def is_polarised(self) -> bool:
