@@ -25,6 +25,9 @@ from stage.pixels import AS_RECORDED, Crop, PixelChoices
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
 """The types of light whose frames are measurements, from which surfaces are solved and images are relit."""
 
+SQUARE = 0.01
+"""The largest difference of a ratio of pixels' sides from that of the camera: anamorphic lenses squeeze by 1.25 and more."""
+
 HEADER_THREADS = 8
 """The number of threads that read file headers while a capture is opened."""
 
@@ -80,7 +83,8 @@ class Capture:
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         headers = capture._check_files()
         capture = capture._exposed(headers)
-        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture.manifest.assumed))
+        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_pixels(headers),
+                                           *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -237,6 +241,14 @@ class Capture:
         default = "" if "color_space" in self.manifest.model_fields_set else " by default"
         return [f"color_space: {space} is declared{default}, and {headers[others[0]].space} by {len(others)} of the {len(headers)} images, "
                 f"{others[0]} the first of them: they are read as {space}; declare the space that they have"] if others else []
+
+    def _other_pixels(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where images declare pixels of another shape than the camera has."""
+        focal_x, focal_y = self.camera.focal_px or (1.0, 1.0)
+        others = sorted(name for name, header in headers.items() if abs(header.pixel_aspect * focal_x / focal_y - 1) > SQUARE)
+        return [f"pixelAspectRatio: is {headers[others[0]].pixel_aspect:.4g} in {len(others)} of the {len(headers)} images, {others[0]} the "
+                f"first of them, and {focal_y / focal_x:.4g} of the camera (focal_px): the images are read by the camera; scale them to square "
+                "pixels, or declare focal_px"] if others else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""
