@@ -246,9 +246,9 @@ class Capture:
         """Return a sentence where images declare pixels of another shape than the camera has."""
         focal_x, focal_y = self.camera.focal_px or (1.0, 1.0)
         others = sorted(name for name, header in headers.items() if abs(header.pixel_aspect * focal_x / focal_y - 1) > SQUARE)
-        return [f"pixelAspectRatio: is {headers[others[0]].pixel_aspect:.4g} in {len(others)} of the {len(headers)} images, {others[0]} the "
-                f"first of them, and {focal_y / focal_x:.4g} of the camera (focal_px): the images are read by the camera; scale them to square "
-                "pixels, or declare focal_px"] if others else []
+        return [f"pixelAspectRatio: is {headers[others[0]].pixel_aspect:.4g} in {len(others)} of the {len(headers)} images, {others[0]} "
+                f"the first of them, and {focal_y / focal_x:.4g} of the camera (focal_px): images are read by the camera; scale them to "
+                "square pixels, or declare focal_px"] if others else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""
