@@ -129,7 +129,7 @@ def _written(source: Path, destination: Path, table: Path, names: Sequence[str],
         "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
         "irradiance_scale": scale,
         "assumed": [*assumed_encoding(space, color_space),
-                    *doubled_lights(names, [light["direction"] if "direction" in light else light["position_m"] for light in lights], table)],
+                    *doubled_lights(names, [light.get("direction", light.get("position_m", [])) for light in lights], table)],
         "frames": frames,
     }, table, destination, folder=source)
     return Imported(written, (
