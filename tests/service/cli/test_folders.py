@@ -19,6 +19,7 @@ from stage.sets.scan_set import SCAN_SET_FILE
 from stage.tof import scan
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"
+TRIANGLE = "solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
 LIGHT = ("--light", "0.1,0.2,0.4,0.05,0.05,0.05")
 
 
@@ -38,12 +39,14 @@ def test_the_names_are_those_that_commands_write():
     ("capture.json", ("fuse", "{}", "--out", "o"), "d: holds no scan-set.json: it holds capture.json, a capture"),
     ("capture.json", ("scan", "{}", "--out", "o"), "d: holds no scan.json: it holds capture.json, a capture"),
     ("scan.json", ("depth", "{}", "--out", "o"), "the shots of a scanning laser, which `relit scan` measures"),
+    ("depth.exr", ("compare", "{}", "--design", "{}/part.stl", "--out", "o"), "d/mesh.ply: is not there: it holds depth.exr, a depth"),
     ("notes.txt", ("solve", "{}", "--out", "o"), "d: holds no capture.json: see `relit import`"),
     ("capture.json", ("export", "{}", "--out", "a.usdz"), "d/maps.exr: is not there: run `relit solve` or `relit depth` first")])
 def test_folders_of_another_kind_are_named(relit, tmp_path, held, arguments, words):
     folder = tmp_path / "d"
     folder.mkdir()
     (folder / held).touch()
+    (folder / "part.stl").write_text(TRIANGLE)
     relit(*(part.format(folder) for part in arguments)).refused(words)
 
 
