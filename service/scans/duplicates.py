@@ -73,14 +73,15 @@ def _written_anew(file: Path, entries: Sequence[ScanEntry]) -> dict[str, str]:
             alike.setdefault(entry.model_dump_json(exclude={"name", "path", "unit"}), []).append(entry)
     same_as: dict[str, str] = {}
     for several in alike.values():
-        kept: list[_Some] = []
-        for entry in sorted(several, key=lambda entry: -vertices_of(file.parent / entry.path)) if len(several) > 1 else ():
-            part = _Some.of(file, entry)
-            whole = next((whole for whole in kept if part.within(whole) and part.is_part_of(_points(file, whole.entry))), None)
-            if whole is None:
-                kept.append(part)
-            else:
-                same_as[entry.name] = whole.entry.name
+        by_size = sorted(several, key=lambda entry: -vertices_of(file.parent / entry.path)) if len(several) > 1 else []
+        left = [_Some.of(file, entry) for entry in by_size]
+        while left:
+            whole, *left = left
+            within = [part for part in left if part.within(whole)]
+            points = _points(file, whole.entry) if within else whole.points
+            parts = {part.entry.name for part in within if part.is_part_of(points)}
+            same_as |= dict.fromkeys(parts, whole.entry.name)
+            left = [part for part in left if part.entry.name not in parts]
     return same_as
 
 
