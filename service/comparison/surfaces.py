@@ -12,6 +12,7 @@ from service.scans.points.ply_points import PlyPoints, read_ply_faces, read_ply_
 from service.scans.viewpoints import find_viewpoints
 from stage.errors import ResultError
 from stage.formats.triangles import Triangles, read_triangles, weld, without_empty_faces
+from stage.results.result_metadata import result_file
 
 PLY = ".ply"
 ON_SURFACE = 1e-6
@@ -135,7 +136,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
     """Read a scan, whose coordinates are in a unit of so many metres.
     Raises ResultError if it has too few points, or nothing tells which side of it is outside: faces, normals, or that it was all seen from
     one place."""
-    file = path / MESH_FILE if path.is_dir() else path
+    file = result_file(path, MESH_FILE, command="relit fuse") if path.is_dir() else path
     if file.suffix.lower() == PLY:
         ply = read_ply_points(file)
         points, normals, sigma, faces = _once(ply, read_ply_faces(file, ply.kept))

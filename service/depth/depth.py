@@ -120,6 +120,8 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
         _check_plausible(solution, capture, request, using)
         _tell_shared_error(solution, capture, using)
+        if capture.camera.projection == "orthographic" and capture.camera.pixel_size_m is None:
+            solution.warnings.append(f"camera.pixel_size_m is missing: x and y of {POINTS_FILE} are in pixels, and its z in metres")
         timings.stage("points", 1)
         cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
     timings.stage("write", 1)

@@ -31,6 +31,7 @@ from stage.colour.colour import convert
 from stage.colour.environment_maps import check_environment, outside_sentences
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError
+from stage.folders import advice
 from stage.formats.ply import POINTS_FILE, PointCloud, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.maps import MAPS_FILE, SurfaceMaps
@@ -80,7 +81,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     depth = request.maps / DEPTH_FILE if request.maps.is_dir() else request.maps
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
     if not of_depth and not path.exists():
-        raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
+        raise ResultError(f"{path}: is not there: {advice(request.maps, 'run `relit solve` or `relit depth` first', of_result=True)}")
     if of_depth or not writer.variants:
         _refuse_surroundings(request)
     if of_depth:
@@ -142,6 +143,7 @@ def _plain(maps: SurfaceMaps) -> str | None:
 
 def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple[str, ...]], timings: Timings) -> Exported:
     maps = DepthMaps.read(path)
+    _require_scale(path, maps.camera)
     beside = path.parent / POINTS_FILE
     cloud: PointCloud | None = read_ply(beside) if beside.exists() else None
     contents = {file.stem: digest(file) for file in (path, beside) if file.exists()}
@@ -151,6 +153,13 @@ def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple
         warnings = write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
                          geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
     return Exported(request.out, warnings, {})
+
+
+def _require_scale(path: Path, camera: Camera) -> None:
+    """Refuse a depth, which is in metres, whose pixels have no size: its surface would be metres deep and pixels wide."""
+    if camera.projection == "orthographic" and camera.pixel_size_m is None:
+        raise AssetError(f"{path}: camera.pixel_size_m is missing: the depth is in metres, and nothing says how wide a pixel is: give it "
+                         "in the capture.json, and run `relit depth` again")
 
 
 def _refuse_surroundings(request: ExportRequest) -> None:
@@ -213,8 +222,10 @@ def export_sequence(request: ExportRequest, timings: Timings) -> tuple[SequenceS
     warnings: list[str] = []
     of_all = {name: value for name, value in first.provenance.items() if name not in OF_ONE_STEP}
     provenance = {**of_all, **export_metadata(request, {"steps": combined(map(digest, files))})}
-    description = Description(request.name or request.out.name.split(".")[0], first.camera, provenance, unit_in_metres(first.camera),
-                              request.version)
+    if of_depth:
+        _require_scale(files[0], first.camera)
+    description = Description(request.name or request.out.name.split(".")[0], first.camera, provenance,
+                              1.0 if of_depth else unit_in_metres(first.camera), request.version)
     timings.stage("steps", len(files))
     sizes = write_sequence_asset(_moments(request, sequence, files, first.camera, warnings, timings), request.out, description,
                                  frames_per_second=sequence.frames_per_second)

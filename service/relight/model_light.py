@@ -26,6 +26,10 @@ MOST_SAMPLES = 4096
 WORTH_SAYING = 1e-3
 """The part of the surface from which on it is said that it is nearer to an area light than the light's samples are apart."""
 
+REMOTE, FAINT = 100.0, 1e-3
+"""How many times as far as the camera a near light is, and below what irradiance, where it is said: positions in millimetres put a light a
+thousand times too far, where its irradiance is a millionth; a far light that is meant is as much stronger."""
+
 NearLight = PointLight | SphereLight | RectangleLight
 
 
@@ -119,6 +123,7 @@ def near_lights(lights: Sequence[NearLight], first_row: int, surface: np.ndarray
     nothing = far(np.zeros((0, 3)), np.zeros((0, 3)))
     fine, coarse, marched, doubts = [nothing], [nothing], [np.zeros((0, 4), np.float32)], []
     for light in lights:
+        doubts += _remote(light, surface)
         if isinstance(light, PointLight):
             axis = None if light.axis is None else np.array(light.axis) / np.linalg.norm(light.axis)
             all_samples = few = sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)
@@ -147,6 +152,21 @@ def _fine_samples(light: SphereLight | RectangleLight, surface: np.ndarray) -> t
         return samples, None
     return samples, (f"{close:.1%} of the surface is within {pitch:.2g} m of an area light at {light.center_m}, nearer than its samples "
                      "are apart: its light shows them there")
+
+
+def _remote(light: NearLight, surface: np.ndarray) -> list[str]:
+    """Return the sentence about a light that is so far from the surface that hardly any of its light arrives."""
+    if isinstance(light, PointLight):
+        place, strength = light.position_m, max(light.intensity)
+        distance = np.linalg.norm(surface - np.array(place), axis=1).min()
+    else:
+        area, distances = _extent(light, surface)
+        place, strength, distance = light.center_m, max(light.radiance) * area, distances.min()
+    reach = np.linalg.norm(surface, axis=1).max()
+    if distance <= REMOTE * reach or strength >= FAINT * distance**2:
+        return []
+    return [f"the light at {place} is {distance / reach:.0f} times as far from the object as the camera's origin, and its irradiance there "
+            f"is {strength / distance**2:.1g}: give places in the unit of the maps, metres where they have a scale, not millimetres"]
 
 
 def _area_samples(light: SphereLight | RectangleLight, count: int) -> Sources:

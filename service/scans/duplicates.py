@@ -1,5 +1,5 @@
-"""Scans that are in a set twice, byte by byte or as point sets that were written anew in another format, unit or order: they tell nothing
-that the first one has not told, and would make it look surer.
+"""Scans that are in a set twice, byte by byte or as point sets that were written anew in another format, unit or order, or thinned: they
+tell nothing that the first one has not told, and would make it look surer.
 
 A scan of the same points that is said to stand elsewhere, or to have other targets, another σ or maps, is another scan.
 """
@@ -32,7 +32,7 @@ class Distinct(NamedTuple):
 
     def warnings(self) -> list[str]:
         """Return a sentence for each duplicate."""
-        return [f"scan {name}: holds the same points as {first}, and counts once" for name, first in self.same_as.items()]
+        return [f"scan {name}: holds no points but those of {first}, and counts once" for name, first in self.same_as.items()]
 
 
 def distinct(file: Path, listed: ScanSet) -> Distinct:
@@ -66,24 +66,53 @@ def _alike(file: Path, listed: ScanSet) -> Iterator[list[int]]:
 
 
 def _written_anew(file: Path, entries: Sequence[ScanEntry]) -> dict[str, str]:
-    """Return which point sets have the points of an earlier one, by their names."""
-    alike: dict[tuple[int, str], list[ScanEntry]] = {}
+    """Return which point sets have no points but those of another one, which has as many and is earlier, or has more; by their names."""
+    alike: dict[str, list[ScanEntry]] = {}
     for entry in entries:
         if (path := file.parent / entry.path).suffix.lower() == ".ply" and path.is_file():
-            alike.setdefault((vertices_of(path), entry.model_dump_json(exclude={"name", "path", "unit"})), []).append(entry)
+            alike.setdefault(entry.model_dump_json(exclude={"name", "path", "unit"}), []).append(entry)
     same_as: dict[str, str] = {}
     for several in alike.values():
-        firsts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for entry in several if len(several) > 1 else ():
-            points = read_ply_points(file.parent / entry.path).points * UNITS_M[entry.unit]
-            bounds, rounding = np.stack([points.min(axis=0), points.max(axis=0)]), ROUNDING * np.abs(points).max()
-            first = next((name for name, (some, around) in firsts.items() if np.abs(around - bounds).max() <= rounding
-                          and KDTree(points).query(some)[0].max() <= rounding), None)
-            if first is None:
-                firsts[entry.name] = points[::max(len(points) // COMPARED, 1)], bounds
-            else:
-                same_as[entry.name] = first
+        by_size = sorted(several, key=lambda entry: -vertices_of(file.parent / entry.path)) if len(several) > 1 else []
+        left = [_Some.of(file, entry) for entry in by_size]
+        while left:
+            whole, *left = left
+            within = [part for part in left if part.within(whole)]
+            points = _points(file, whole.entry) if within else whole.points
+            parts = {part.entry.name for part in within if part.is_part_of(points)}
+            same_as |= dict.fromkeys(parts, whole.entry.name)
+            left = [part for part in left if part.entry.name not in parts]
     return same_as
+
+
+class _Some(NamedTuple):
+    """Some of the points of a set, and the bounds of all."""
+
+    entry: ScanEntry
+    points: np.ndarray  # [n, 3] metres
+    bounds: np.ndarray  # [2, 3] metres
+    rounding: float  # metres
+
+    @classmethod
+    def of(cls, file: Path, entry: ScanEntry) -> "_Some":
+        points = _points(file, entry)
+        return cls(entry, points[::max(len(points) // COMPARED, 1)], np.stack([points.min(axis=0), points.max(axis=0)]),
+                   ROUNDING * float(np.abs(points).max()))
+
+    def within(self, whole: "_Some") -> bool:
+        """Return whether the bounds lie in those of another set."""
+        return bool((self.bounds[0] >= whole.bounds[0] - self.rounding).all() and (self.bounds[1] <= whole.bounds[1] + self.rounding).all())
+
+    def is_part_of(self, points: np.ndarray) -> bool:
+        """Return whether the points are points of another set; a few are looked for first, because most sets have not even these."""
+        few = self.points[::max(len(self.points) // 3, 1)]
+        return all((np.abs(points - point) <= self.rounding).all(axis=1).any() for point in few) and \
+            bool(KDTree(points).query(self.points)[0].max() <= self.rounding)
+
+
+def _points(file: Path, entry: ScanEntry) -> np.ndarray:
+    """Return the points of a set, [n, 3] metres."""
+    return read_ply_points(file.parent / entry.path).points * UNITS_M[entry.unit]
 
 
 def _measured(file: Path, path: str) -> Path:

@@ -28,8 +28,9 @@ METRIC = (".e57", ".ptx", ".las", ".laz")
 """Formats of scanners of buildings and land, which are in metres."""
 USUAL_M = (0.01, 10.0)
 """The sizes that another unit would have to give it."""
-MIXED = 100.0
-"""Scans of one object that differ so many times in size may be in different units."""
+MIXED, MIXED_UNSAID = 100.0, 12.0
+"""Scans of one object that differ so many times in size may be in different units; the second is for formats without a unit, where inches
+among millimetres differ 25 times, and what one scan saw of the object and another by up to two."""
 FOR_POINTS = {"unit": "--unit", "viewpoint_m": "--viewpoint", "poses": "--poses"}
 FOR_FRAMES = {"poses": "--poses", "intrinsics_px": "--intrinsics", "every": "--every", "depth_unit_m": "--depth-unit-m"}
 """The options that point files, and the frames of a depth camera, take beside those of a turntable; results of relit depth take none."""
@@ -177,7 +178,7 @@ def _doubts(request: ScansImport, scans: list[FileScan], sizes: list[float], met
     `metric`: the format says the unit, or is one of large places."""
     said = []
     largest, smallest = int(np.argmax(sizes)), int(np.argmin(sizes))
-    if sizes[largest] > MIXED * sizes[smallest]:
+    if sizes[largest] > (MIXED if metric else MIXED_UNSAID) * sizes[smallest]:
         said.append(("warning", f"{scans[largest].name} is {sizes[largest]:.3g} m large and {scans[smallest].name} "
                                 f"{sizes[smallest]:.3g} m: are they in one unit? import those of another unit apart"))
     elif not metric and not SMALL_M < sizes[largest] < LARGE_M:

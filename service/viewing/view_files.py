@@ -34,6 +34,7 @@ from stage.colour.colour_spaces import NAMES, linear_space
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError, StageError, StorageError, storage
 from stage.files import replacing, write_text
+from stage.folders import advice
 from stage.motion.tracking import tracking_frames
 from stage.results.depth_maps import DEPTH_FILE
 from stage.results.light_basis import numbers
@@ -207,7 +208,8 @@ def result_file(maps: Path) -> Path:
     for name in (MAPS_FILE, DEPTH_FILE):
         if (maps / name).is_file():
             return maps / name
-    raise ResultError(f"{maps}: holds neither {MAPS_FILE} nor {DEPTH_FILE}: run `relit solve` or `relit depth` first")
+    advised = advice(maps, "run `relit solve` or `relit depth` first", of_result=True)
+    raise ResultError(f"{maps}: holds neither {MAPS_FILE} nor {DEPTH_FILE}: {advised}")
 
 
 def _mask(capture: Capture) -> np.ndarray:

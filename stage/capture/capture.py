@@ -10,10 +10,11 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, Light, OffLight, PointLight
-from stage.capture.manifest import FILE_NAME, Frame, Manifest, read_manifest
+from stage.capture.manifest import FILE_NAME, LIT_BY, Frame, Manifest, read_manifest
 from stage.colour import radiance as radiances
 from stage.colour.colour_spaces import is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
+from stage.folders import advice
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.formats.exif import Exposure, check_agreement, exposure_times, multiplied_otherwise, unused_exposures
@@ -23,6 +24,9 @@ from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
 """The types of light whose frames are measurements, from which surfaces are solved and images are relit."""
+
+SQUARE = 0.01
+"""The largest difference of a ratio of pixels' sides from that of the camera: anamorphic lenses squeeze by 1.25 and more."""
 
 HEADER_THREADS = 8
 """The number of threads that read file headers while a capture is opened."""
@@ -74,11 +78,13 @@ class Capture:
             if not folder.is_dir():
                 raise ManifestError(f"{folder}: there is no such folder")
             if not (folder / FILE_NAME).exists():
-                raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
+                advised = advice(folder, "see `relit import` for data laid out another way")
+                raise ManifestError(f"{folder}: holds no {FILE_NAME}: {advised}")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         headers = capture._check_files()
         capture = capture._exposed(headers)
-        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture.manifest.assumed))
+        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_pixels(headers),
+                                           *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -142,6 +148,12 @@ class Capture:
         """
         frames = self.manifest.frames
         return [frames[index] for index in source_places([frame.light for frame in frames])]
+
+    def none_is_lit(self, by: str) -> str:
+        """Return the sentence for a capture without a frame that is lit `by` what is asked for; it names the command for other frames."""
+        kinds = [kind for kind in LIT_BY if kind != "light" and any(getattr(frame, kind) is not None for frame in self.manifest.frames)]
+        other = f": frames with {' and '.join(kinds)} are for relit depth" if kinds else ""
+        return f"{self.folder / FILE_NAME}: frames: none is lit by {by}{other}"
 
     @property
     def is_polarised(self) -> bool:
@@ -229,6 +241,14 @@ class Capture:
         default = "" if "color_space" in self.manifest.model_fields_set else " by default"
         return [f"color_space: {space} is declared{default}, and {headers[others[0]].space} by {len(others)} of the {len(headers)} images, "
                 f"{others[0]} the first of them: they are read as {space}; declare the space that they have"] if others else []
+
+    def _other_pixels(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where images declare pixels of another shape than the camera has."""
+        focal_x, focal_y = self.camera.focal_px or (1.0, 1.0)
+        others = sorted(name for name, header in headers.items() if abs(header.pixel_aspect * focal_x / focal_y - 1) > SQUARE)
+        return [f"pixelAspectRatio: is {headers[others[0]].pixel_aspect:.4g} in {len(others)} of the {len(headers)} images, {others[0]} "
+                f"the first of them, and {focal_y / focal_x:.4g} of the camera (focal_px): images are read by the camera; scale them to "
+                "square pixels, or declare focal_px"] if others else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""

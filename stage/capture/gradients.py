@@ -49,7 +49,7 @@ def gradient_frames(capture: Capture) -> GradientFrames:
     missing."""
     where = capture.folder / FILE_NAME
     if not has_gradients(capture):
-        raise ManifestError(f"{where}: frames: none is lit by a gradient light, which --method gradient needs")
+        raise ManifestError(capture.none_is_lit("a gradient light, which --method gradient needs"))
     rows: dict[str, np.ndarray] = {}
     frames = capture.sources()
     for index, frame in enumerate(frames):

@@ -93,7 +93,7 @@ def distant_lights(capture: Capture) -> DistantLights:
             raise ManifestError(f"{where}: frames[{index}].light: is {frame.light.type}: this needs distant lights{hint}")
     lights = [light for _, light in capture.lit_by(DistantLight)]
     if not lights:
-        raise ManifestError(f"{where}: frames: none is lit by a distant light")
+        raise ManifestError(capture.none_is_lit("a distant light"))
     found = DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
     check_pairs(capture, found.direction)
     return found

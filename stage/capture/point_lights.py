@@ -65,7 +65,7 @@ def light_places(capture: Capture) -> LightPlaces:
             kind = frame.light.type
             raise ManifestError(f"{where}: frames[{index}].light: is {kind}: this needs distant or point lights{hint}")
     if not lights:
-        raise ManifestError(f"{where}: frames: none is lit by a distant or point light")
+        raise ManifestError(capture.none_is_lit("a distant or point light"))
     place, strength, lobe = np.zeros((len(lights), 4)), np.zeros((len(lights), 3)), np.zeros((len(lights), 4))
     for row, (_, light) in enumerate(lights):
         if isinstance(light, DistantLight):

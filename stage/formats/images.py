@@ -1,10 +1,11 @@
 """Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, PPM, raw), the header first, then pixels; writing of PNG."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import OpenImageIO as oiio
@@ -37,6 +38,7 @@ class ImageHeader(NamedTuple):
     half: bool = False  # whether all colour channels hold half values
     multiplied: float = 1.0  # the factor that a Radiance file says its values were multiplied by
     space: str = ""  # the scene-linear colour space that an EXR file declares; empty where it declares none that is known
+    pixel_aspect: float = 1.0  # the width of a pixel over its height, as an EXR file declares
 
 
 class Decoder(Protocol):
@@ -71,6 +73,12 @@ def read_header(path: str | Path) -> ImageHeader:
         return header_of(source)
 
 
+def _pixel_aspect(metadata: Mapping[str, Any]) -> float:
+    """Return the shape of pixels that an EXR file declares; 1 where it is no positive number."""
+    declared = float(metadata.get("pixelAspectRatio", 1.0))
+    return declared if math.isfinite(declared) and declared > 0 else 1.0
+
+
 def header_of(source: inputs.Source) -> ImageHeader:
     """Read the size and the channels of an image that is open; errors are those of `read_header`."""
     path, suffix = source.path, source.path.suffix.lower()
@@ -82,7 +90,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
         except ValueError:
             space = ""
         return ImageHeader(header.width, header.height, len(colours), len(header.channels), False, half=header.half.issuperset(colours),
-                           space=space if space in exr.PRIMARIES else "")
+                           space=space if space in exr.PRIMARIES else "", pixel_aspect=_pixel_aspect(header.metadata))
     _check_suffix(path)
     if suffix == ".png":
         integrity.check_png(path, source.file, contents=False)

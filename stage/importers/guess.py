@@ -6,12 +6,13 @@ Names and tables are looked at first, then the images themselves (stage.importer
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
+from stage.folders import advice
 from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.content import Pictures
@@ -28,6 +29,8 @@ from stage.importers.video import is_video
 from stage.results.depth_maps import DEPTH_FILE
 from stage.tof.raw_frames import read_array
 
+REPORT = "report.json"
+"""The file that every result folder of relit has."""
 POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz", ".e57")
 """The endings of files of points."""
 
@@ -45,6 +48,8 @@ def guess(source: Path) -> Guess:
         names = tuple(natural_order(path.name for path in source.iterdir() if path.is_file() and not path.name.startswith(".")))
     if FILE_NAME in names:
         raise ManifestError(f"{source}: is a capture already: relit info {shlex.quote(str(source))} looks at it")
+    if REPORT in names and (held := advice(source, "")):
+        raise ManifestError(f"{source}: is a result of relit, which needs no import: {held}")
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
     refuse_twins(source, pictures)
     shown = Pictures(source, pictures)
@@ -205,6 +210,9 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
         table = tried(partial(read_light_table, path))
         if table is None or len(table.vectors) < 3:
             continue
+        missing = _not_there(folder, table.names or ())
+        if missing and len(missing) > len(table.names or ()) - 3:  # the table of other images, as of a basis that was made elsewhere
+            continue
         chosen = [] if table.names is not None else group_of(folder, len(table.vectors))
         if chosen is None:
             continue
@@ -217,13 +225,20 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
                 f"{'towards' if ahead else 'away'}")
         return made("images under one far light each with a table of the lights", reason,
                      ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
-                     folder.path, solve=True, sure=mirrored or min(across, up) > -guess_images.FOLLOWED,
+                     folder.path, solve=True, sure=not missing and (mirrored or min(across, up) > -guess_images.FOLLOWED),
                      summary=lit(len(table.vectors), "from {} directions", path), assumed=(
                          "the bright side of the object tells where x and y point, and vectors point to the light" if mirrored else
                          "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
                          f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side",
+                         *([f"{len(missing)} images of {path.name} are not there, {missing[0]} the first"] if missing else ()),
                          *encoding(folder)))
     return None
+
+
+def _not_there(folder: Folder, names: Sequence[str]) -> list[str]:
+    """Return the images that a table names and no file of the folder is, whatever its suffix."""
+    there = {Path(name).stem.lower() for name in folder.names}
+    return [name for name in names if Path(name.replace("\\", "/")).stem.lower() not in there and not (folder.path / name).exists()]
 
 
 def _correlations(folder: Folder) -> Guess | None:

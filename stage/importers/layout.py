@@ -42,6 +42,10 @@ OFF_PART, SAME_PART = 0.2, 0.1
 part differs between the sides, at most."""
 
 
+MOST_DOUBLED, MOST_NAMED = 0.25, 3
+"""The largest part of the lights of a table that may be there twice by mistake, and how many of them are named."""
+
+
 class Imported(NamedTuple):
     """The capture that an importer wrote, and how it understood the folder."""
 
@@ -228,3 +232,15 @@ def _npy(array: np.ndarray) -> bytes:
 def _alike(a: Path, b: Path) -> bool:
     first, second = a.stat(), b.stat()
     return first.st_size == second.st_size and int(first.st_mtime) == int(second.st_mtime)
+
+
+def doubled_lights(labels: Sequence[str], places: Sequence[Sequence[float]], table: Path) -> list[str]:
+    """Return the sentence about lights of a table that are exactly where one before is, as where a line was copied and not changed.
+    Where most lights are in it twice or more, as of exposures or polarisers, nothing is said. `labels`: what names each light."""
+    first: dict[tuple[float, ...], int] = {}
+    pairs = [(before, index) for index, place in enumerate(places) if (before := first.setdefault(tuple(place), index)) != index]
+    if not pairs or len(pairs) > MOST_DOUBLED * len(labels):
+        return []
+    named = ", ".join(f"{labels[before]} and {labels[index]}" for before, index in pairs[:MOST_NAMED])
+    more = f" and {len(pairs) - MOST_NAMED} more" if len(pairs) > MOST_NAMED else ""
+    return [f"frames[].light: {table.name} has one light for {named}{more}: check that no line was copied, or leave one of the images out"]

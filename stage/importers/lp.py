@@ -17,6 +17,7 @@ from stage.importers.camera_options import View
 from stage.importers.layout import (
     assumed_encoding,
     color_space_of,
+    doubled_lights,
     image_named,
     image_names,
     image_resolution,
@@ -61,7 +62,9 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     return write_capture({
         "name": path.stem,
         "color_space": space,
-        "assumed": [*assumed_encoding(space, color_space), *_lengths(path, frames)],
+        "assumed": [*assumed_encoding(space, color_space), *_lengths(path, frames), *doubled_lights(
+            [f"line {number} ({frame['image']})" for (number, _), frame in zip(rows, frames, strict=True)],
+            [frame["light"]["direction"] for frame in frames], path)],
         "camera": (view or View()).entry(resolution),
         "mask": mask,
         "irradiance_scale": scale,

@@ -20,6 +20,7 @@ from stage.importers.layout import (
     Imported,
     assumed_encoding,
     color_space_of,
+    doubled_lights,
     image_named,
     image_resolution,
     light_scale,
@@ -126,7 +127,10 @@ def _written(source: Path, destination: Path, table: Path, names: Sequence[str],
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
         "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
-        "irradiance_scale": scale, "assumed": assumed_encoding(space, color_space), "frames": frames,
+        "irradiance_scale": scale,
+        "assumed": [*assumed_encoding(space, color_space),
+                    *doubled_lights(names, [light.get("direction", light.get("position_m", [])) for light in lights], table)],
+        "frames": frames,
     }, table, destination, folder=source)
     return Imported(written, (
         *facts, ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),

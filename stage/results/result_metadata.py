@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from stage.capture.camera import Camera
 from stage.errors import ResultError
+from stage.folders import advice
 
 PREFIX, CAMERA = "relit:", "relit:camera"
 
@@ -32,5 +33,5 @@ def result_file(given: Path, name: str, *, command: str) -> Path:
     """Return a result file that is given as itself or by its folder."""
     file = given / name if given.is_dir() else given
     if not file.is_file():
-        raise ResultError(f"{file}: is not there: run `{command}` first")
+        raise ResultError(f"{file}: is not there: {advice(given, f'run `{command}` first', of_result=True)}")
     return file

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from stage.errors import ManifestError
 from stage.files import write_text
+from stage.folders import advice
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
 from stage.records import faults_of_each, read_record, record_text
 from stage.transforms import ROTATION_ROUNDING, Row, off_rotation, rigid_fault, rotation_about
@@ -160,7 +161,8 @@ def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
     """Read and check a scan-set.json; `path`: the file, or the folder with it."""
     file = path / SCAN_SET_FILE if path.is_dir() else path
     if path.is_dir() and not file.exists():
-        raise ManifestError(f"{path}: holds no {SCAN_SET_FILE}: `relit import scans` writes one for a folder of scans")
+        advised = advice(path, "`relit import scans` writes one for a folder of scans")
+        raise ManifestError(f"{path}: holds no {SCAN_SET_FILE}: {advised}")
     return file, read_record(file, ScanSet, _faults)
 
 

@@ -175,7 +175,7 @@ class Ingest:
         capture."""
         frames = capture.sources()
         if not frames:
-            raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
+            raise ManifestError(capture.none_is_lit("a distant, point, extended or gradient light"))
         folder = cache if cache is not None else capture.folder / CACHE_FOLDER
         fingerprints = Fingerprints(capture.folder, folder / FINGERPRINTS)
         hint = "" if cache is not None else " (--cache names another folder for it)"

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from stage.errors import CalibrationError, ImageError, ManifestError, storage
+from stage.folders import advice
 from stage.model import Count, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.raw_frames import read_array
@@ -112,7 +113,8 @@ def read_scan(path: str | Path) -> Shots:
     folder = given.parent if given.name == FILE_NAME else given
     with storage("read", folder):
         if not (folder / FILE_NAME).is_file():
-            raise ManifestError(f"{folder}: holds no {FILE_NAME}")
+            advised = advice(folder, "`relit scan` takes the shots of a scanning laser")
+            raise ManifestError(f"{folder}: holds no {FILE_NAME}: {advised}")
     scan = read_record(folder / FILE_NAME, Scan)
     for name in (scan.shots, *(() if scan.waveforms is None else (scan.waveforms.file,))):
         if Path(name).is_absolute() or ".." in Path(name).parts:

@@ -153,3 +153,17 @@ def texture_faults(parts: Iterable[Part]) -> Iterator[str]:
             yield f"{part.name}: {part.facts['file']} is no image that can be read, or a damaged one"
         elif part.kind == "texture" and part.facts.get("missing") and not part.facts["file"]:
             yield f"{part.name}: the texture names no file"
+
+
+USUAL_M = (1e-3, 100.0)
+"""Largest sides, metres, between which an asset of meshes needs no question: objects of a stage are a few millimetres to some metres large,
+and a wrong unit makes them a hundred or a thousand times as large or small."""
+
+
+def size_doubts(extent_m: np.ndarray | None, unit: str) -> list[str]:
+    """Return the sentence about an asset of meshes whose size is not that of an object; `extent_m`: its bounding box [2, 3], None: none;
+    `unit`: where the asset says its unit."""
+    side = 0.0 if extent_m is None else float(np.ptp(extent_m, axis=0).max())
+    if side == 0 or not np.isfinite(side) or USUAL_M[0] <= side <= USUAL_M[1]:
+        return []
+    return [f"the asset is {side:.3g} m large: {unit}: if it should not be, scale it or correct that"]

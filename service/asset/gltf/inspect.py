@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
+import numpy as np
 from pygltflib import GLTF2, POINTS, TRIANGLES
 
-from service.asset.content.surface import Inspection, Part, image_facts, texture_faults
+from service.asset.content.surface import Inspection, Part, image_facts, size_doubts, texture_faults
 from service.asset.gltf.container import COMPONENT_BYTES, ELEMENT_SIZES, GlbContents, read_glb
 from service.asset.gltf.geometry_faults import geometry_faults
 from service.errors import AssetError
 from stage.errors import storage
+
+SIGNATURES = {"png": b"\x89PNG\r\n\x1a\n", "jpeg": b"\xff\xd8\xff", "ktx2": b"\xabKTX 20\xbb"}
+"""The first bytes of images, by the end of their media types."""
 
 
 def inspect_glb(path: Path) -> Inspection:
@@ -42,6 +46,12 @@ def _inspect(path: Path, contents: GlbContents) -> Inspection:
               if each.uri and not each.uri.startswith("data:")]
     warnings = [f"the asset needs {file}, which lies outside of it" for file in beside]
     errors = [f"{file} is not there, and the document refers to it" for file in beside if not file.is_file()]
+    corners = [corner for part in parts if part.kind == "mesh" for corner in (part.facts["low"], part.facts["high"])]
+    if corners and all(corner and len(corner) == 3 for corner in corners) and all(
+            node.matrix is None and node.scale is None for node in document.nodes):
+        warnings += size_doubts(np.array(corners), "glTF is in metres")
+    errors += [f"{part.name}: {part.facts['file']} is declared as {part.facts['declared']}, and is {part.facts['format']}: correct its "
+               "mimeType" for part in parts if "declared" in part.facts]
     size = path.stat().st_size + sum(file.stat().st_size for file in beside if file.is_file())
     return Inspection(str(path), size, facts, tuple(parts), provenance, tuple(warnings),
                       (*contents.faults, *errors, *(list(_faults(contents)) or geometry_faults(path, contents)), *texture_faults(parts)))
@@ -87,13 +97,20 @@ def _image(path: Path, contents: GlbContents, number: int) -> dict[str, Any]:
             data = b64decode(text, validate=True) if head.endswith(";base64") else unquote_to_bytes(text)
         except ValueError:  # no base64
             data = b""
-        return {"file": name, **image_facts(data, f"{name}.{kind}")}
+        return {"file": name, **_facts_of(data, name, kind)}
     if image.bufferView is None:
         return {"file": name}
     view = contents.document.bufferViews[image.bufferView]
     with open(path, "rb") as stream:
         stream.seek(contents.data_start + (view.byteOffset or 0))
-        return {"file": name, **image_facts(stream.read(min(view.byteLength, contents.data_size)), f"{name}.{kind}")}
+        return {"file": name, **_facts_of(stream.read(min(view.byteLength, contents.data_size)), name, kind)}
+
+
+def _facts_of(data: bytes, name: str, kind: str) -> dict[str, Any]:
+    """Return the facts of an image, read as what it is; what it is and is declared to be, where these differ."""
+    found = next((format_ for format_, begin in SIGNATURES.items() if data.startswith(begin)), None)
+    differs = found is not None and kind.lower().replace("jpg", "jpeg") != found
+    return image_facts(data, f"{name}.{found or kind}") | ({"declared": kind or "nothing", "format": found} if differs else {})
 
 
 def _faults(contents: GlbContents) -> Iterator[str]:

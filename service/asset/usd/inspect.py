@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
-from service.asset.content.surface import Inspection, Part, image_facts, texture_doubts, texture_faults
+from service.asset.content.surface import Inspection, Part, image_facts, size_doubts, texture_doubts, texture_faults
 from service.asset.usd.files import reason_of
 from service.asset.usd.geometry_faults import geometry_doubts, geometry_faults
 from service.asset.usd.layers import PURPOSES
@@ -55,8 +55,12 @@ def inspect_usd(path: Path) -> Inspection:
     beside = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]).resolve() for file in [*(layer.realPath for layer in layers), *files]}
     size = sum(file.stat().st_size for file in beside | {path.resolve()} if file.is_file())
     names = sorted(relpath(layer.realPath or layer.identifier, path.parent) for layer in layers if layer != usd_stage.GetRootLayer())
+    facts = _facts(usd_stage)
+    if any(part.kind == "mesh" for part in parts.values()):
+        told = "" if usd_stage.HasAuthoredMetadata("metersPerUnit") else ", which it does not say,"
+        warnings += size_doubts(facts.get("extent_m"), f"its metersPerUnit{told} is {facts['meters_per_unit']:g}")
     inspection = Inspection(
-        str(path), size, {**_facts(usd_stage), "layers": names, "validators": len(validators)}, tuple(parts.values()),
+        str(path), size, {**facts, "layers": names, "validators": len(validators)}, tuple(parts.values()),
         dict(_flat(usd_stage.GetRootLayer().customLayerData)), tuple(sorted(set(warnings))), tuple(sorted(set(errors))))
     del quiet
     return inspection

@@ -44,7 +44,8 @@ class Answer(NamedTuple):
 
 
 def require_target(url: str, networks: Sequence[str]) -> None:
-    """Raise RequestError if a URL has no host, has a password, or has an address in place of a name to which nothing is sent."""
+    """Raise RequestError if a URL has no host, has a password, or has an address to which nothing
+    is sent, or is http:// where no network is allowed."""
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
@@ -56,6 +57,9 @@ def require_target(url: str, networks: Sequence[str]) -> None:
     try:
         address = ip_address(host)
     except ValueError:  # a name, which is looked up when something is sent
+        if parts.scheme != "https" and not networks:
+            raise RequestError("url: http:// is for networks of the setting hook_networks, which this service has none of: give https://, "
+                               "or set it") from None
         return
     _require_allowed(parts.scheme, address, networks)
 

@@ -261,6 +261,26 @@ def test_the_bright_side_of_the_object_tells_a_mirrored_table(relit, tmp_path):
     assert np.allclose(directions, scene.directions, atol=1e-5)
 
 
+def test_a_table_of_other_images_is_none(relit, tmp_path):
+    """The light table of a result, as `relit basis` writes it, beside other images; of which some are missing, the guess is not sure."""
+    names = write_images(tmp_path)
+    named = {"lights": [{"image": name, "direction": row} for name, row in zip(names, SCENE.directions.tolist(), strict=True)]}
+    (tmp_path / "basis.exr.json").write_text(json.dumps(named))
+    assert "sure     yes" in relit("import", "guess", tmp_path).well()
+    (tmp_path / "a1.png").unlink()
+    said = relit("import", "guess", tmp_path).well()
+    assert "1 images of basis.exr.json are not there, a1.png the first" in said and "sure     yes" not in said
+    for name in names[1:]:
+        (tmp_path / name).rename(tmp_path / f"other_{name}")
+    relit("import", "guess", tmp_path).refused("which is no layout that relit import knows")
+
+
+def test_results_need_no_import(relit, tmp_path):
+    for name in ("maps.exr", "report.json"):
+        (tmp_path / name).touch()
+    relit("import", "guess", tmp_path).refused("is a result of relit, which needs no import: it holds maps.exr, solved maps")
+
+
 def test_correlations_with_more_words_in_their_names(relit, tmp_path):
     for name, image in zip((0, 90, 180, 270), correlations([60e6], [0, 90, 180, 270]), strict=True):
         np.save(tmp_path / f"phase{name}_avg.npy", image)

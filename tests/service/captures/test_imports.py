@@ -53,6 +53,24 @@ def test_the_scale_of_the_lights_gives_that_of_albedo(relit, tmp_path, layout):
     assert np.abs(albedo - scene.albedo)[scene.mask].max() < 2e-3  # half rounding of the stack and of the layers
 
 
+@pytest.mark.parametrize("layout", ["lp", "olat"])
+def test_a_light_that_a_table_has_twice_is_named(relit, tmp_path, layout):
+    """A line that was copied and not changed; tables in which every light is twice, of two exposures, are as they should be."""
+    scene = make_scene(8, 8)
+    words = ["--axes", "right,up,towards", "--vectors", "to-light"] if layout == "olat" else []
+    said = {}
+    for what, order in (("copied", [0, 1, 2, 3, 4, 2, 6, 7]), ("right", range(8)), ("twice", [0, 0, 1, 1, 2, 2, 3, 3])):
+        folder = tmp_path / what
+        for number, image in enumerate(scene.images):
+            write_exr(folder / f"{number}.exr", image)
+        rows = [f"{number}.exr {' '.join(map(str, scene.directions[light]))}" for number, light in enumerate(order)]
+        (folder / "dome.lp").write_text("\n".join(["8", *rows]) + "\n")
+        relit("import", layout, folder, *words).well()
+        said[what] = [words for words in Capture.open(folder).doubts if "has one light for" in words]
+    assert said["right"] == said["twice"] == [] and len(said["copied"]) == 1
+    assert f"dome.lp has one light for {'line 4 (2.exr) and line 7 (5.exr)' if layout == 'lp' else '2.exr and 5.exr'}:" in said["copied"][0]
+
+
 def test_axes_are_asked_for_and_never_guessed(relit, tmp_path):
     relit("import", "olat", tmp_path, "--vectors", "to-light").refused("--axes")
     relit("import", "olat", tmp_path, "--vectors", "to-light", "--axes", "right,up,forward").refused("axes")

@@ -100,6 +100,7 @@ def test_points_of_depths_move(scans, tmp_path):
     found = exported(scans / "sequence.json", tmp_path / "scan.usdc", geometry=Geometry.POINTS)
     usd_stage = Usd.Stage.Open(str(found.path))
     points = UsdGeom.Points.Get(usd_stage, "/Walk_1/Geom/Points")
+    assert UsdGeom.GetStageMetersPerUnit(usd_stage) == 1  # a depth is in metres, whether its camera knows how far the surface is or not
     assert points.GetPointsAttr().GetTimeSamples() == [0, 1] and usd_stage.GetTimeCodesPerSecond() == 24
     for time in (0, 1):
         assert len(points.GetPointsAttr().Get(time)) == len(points.GetWidthsAttr().Get(time)) > 5000

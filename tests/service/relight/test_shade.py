@@ -44,6 +44,19 @@ def test_a_point_light_is_the_model_pixel_by_pixel(relit, maps, tmp_path):
     assert (rgb(tmp_path / "p.exr")[~SURFACE.mask] == 0).all()
 
 
+@pytest.mark.parametrize("light", [("--light", [10, 15, 30], [2e-3] * 3), ("--sphere", [10, 15, 30], [0.01], [5, 4, 3])])
+def test_places_in_millimetres_are_named(relit, maps, tmp_path, light):
+    """A thousand times as far gives a millionth of the light, which was said only where half floats have no steps for it. The light at its
+    place, or with the strength for where it is, is said nothing about."""
+    option, place, *rest = light
+    outcome = relit("shade", maps, option, text(np.array(place), *rest), "--out", tmp_path / "p.exr", "--exposure", "20")
+    assert outcome.code == 0 and "the light at (10.0, 15.0, 30.0) is " in outcome.out and "not millimetres" in outcome.out
+    *size, strength = rest
+    for far, factor in ((1e-3, 1), (1, 1e5)):
+        near = text(np.array(place) * far, *size, np.array(strength) * factor)
+        assert "warning" not in relit.done("shade", maps, option, near, "--out", tmp_path / "p.exr").out
+
+
 def test_two_materials_of_a_pixel_are_their_mean(relit, tmp_path):
     """Left of the middle a share of another lobe, right of it one material. Tolerance: half rounding of two lobes and the share."""
     place, share = np.array([0.01, 0.015, 0.03]), 0.7

@@ -27,7 +27,8 @@ def ascii_ply(points: np.ndarray) -> str:
 
 @pytest.mark.parametrize(("again", "keys", "same"), [
     (surface(0)[::-1], {}, True), (1e3 * surface(0), {"unit": "mm"}, True), (1e3 * surface(0), {}, False), (surface(1), {}, False),
-    (surface(0), {"viewpoint_m": [0, 0, 1]}, False)], ids=["order", "unit", "another size", "another scan", "another viewpoint"])
+    (surface(0), {"viewpoint_m": [0, 0, 1]}, False), (surface(0)[::3], {}, True), (surface(1)[::3], {}, False)],
+    ids=["order", "unit", "another size", "another scan", "another viewpoint", "thinned", "another scan, thinned"])
 def test_points_that_are_written_anew_count_once(tmp_path, again, keys, same):
     points = surface(0)
     write_ply(PointCloud(points.astype(np.float32), np.zeros(points.shape, np.uint8)), tmp_path / "first.ply")
@@ -37,4 +38,15 @@ def test_points_that_are_written_anew_count_once(tmp_path, again, keys, same):
     found = distinct(*read_scan_set(tmp_path))
     assert found.same_as == ({"again": "first"} if same else {})
     assert len(found.scans.scans) == (1 if same else 2)
-    assert not same or found.warnings() == ["scan again: holds the same points as first, and counts once"]
+    assert not same or found.warnings() == ["scan again: holds no points but those of first, and counts once"]
+
+
+def test_the_whole_scan_is_kept_of_its_thinned_copies(tmp_path):
+    """A copy that is listed before the scan, and one of the copy."""
+    sets = {"thin": surface(0)[::2], "whole": surface(0), "thinner": surface(0)[::6], "other": surface(1)}
+    for name, points in sets.items():
+        (tmp_path / f"{name}.ply").write_text(ascii_ply(points))
+    (tmp_path / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "x", "scans": [
+        {"name": name, "path": f"{name}.ply"} for name in sets]}))
+    found = distinct(*read_scan_set(tmp_path))
+    assert found.same_as == {"thin": "whole", "thinner": "whole"} and [scan.name for scan in found.scans.scans] == ["whole", "other"]

@@ -163,6 +163,14 @@ def test_sizes_that_ask_for_another_unit_are_asked_about(relit, tmp_path):
     assert "scan_24 is" in said and "scan_0 1 m: are they in one unit?" in said
 
 
+@pytest.mark.parametrize(("of_first", "of_second", "asked"), [(1, 1 / 39.37, True), (1, 2 / 25.4, True), (1, 1 / 5, False)])
+def test_a_scan_in_inches_among_others_is_asked_about(relit, tmp_path, of_first, of_second, asked):
+    """Inches among metres; inches among millimetres, of which that scan saw twice as much; and a scan of a fifth of the object."""
+    slab = np.vstack([np.random.default_rng(5).uniform(0, 1, (400, 3)) * [1, 0.7, 0.01], [[0.0, 0, 0], [1, 0, 0]]])
+    said = relit.done("import", "scans", write(tmp_path / "mixed", [of_first * slab, of_second * slab]), tmp_path / "set").out
+    assert ("are they in one unit?" in said) == asked
+
+
 def test_rotations_off_orthonormal_are_made_rotations_and_said(relit, tmp_path, views):
     """Scan sets, PTX files and .conf files are treated alike; stretches of a thousandth and more are no poses."""
     folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])

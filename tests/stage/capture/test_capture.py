@@ -35,6 +35,19 @@ def test_another_colour_space_in_the_images_is_said(tmp_path):
     assert Capture.open(tmp_path).doubts == ()
 
 
+def test_pixels_of_another_shape_than_the_camera_are_named(tmp_path):
+    """Anamorphic images, which were read as if their pixels were square; a camera whose focal lengths say the shape has no doubt."""
+    write_capture(tmp_path, SCENE)
+    for index in (1, 2):
+        write_exr(tmp_path / f"{index:03d}.exr", SCENE.images[index], pixelAspectRatio=2.0)
+    doubt, = Capture.open(tmp_path).doubts
+    assert "pixelAspectRatio: is 2 in 2 of the 4 images, 001.exr the first of them, and 1 of the camera" in doubt
+    for index in range(4):
+        write_exr(tmp_path / f"{index:03d}.exr", SCENE.images[index], pixelAspectRatio=2.0)
+    edit_manifest(tmp_path, camera={"projection": "perspective", "resolution": list(SCENE.images[0].shape[1::-1]), "focal_px": [50, 100]})
+    assert Capture.open(tmp_path).doubts == ()
+
+
 def test_a_folder_or_its_manifest(tmp_path):
     write_capture(tmp_path, SCENE)
     by_folder, by_file = Capture.open(tmp_path), Capture.open(tmp_path / "capture.json")

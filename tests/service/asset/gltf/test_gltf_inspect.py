@@ -1,5 +1,6 @@
 """What relit inspect says of a .glb, and its file complete or absent."""
 
+import dataclasses
 import json
 import re
 import struct
@@ -104,6 +105,24 @@ def test_a_file_outside_is_a_warning(tmp_path):
     found = inspect_glb(path)
     assert found.errors == () and "a b.bin, which lies outside of it" in found.warnings[0]
     assert found.size_bytes == path.stat().st_size + 100
+
+
+def test_images_of_another_type_than_declared_are_errors(tmp_path):
+    """Viewers decode by the type that is declared; relit inspect reads the image as what it is."""
+    path = rewritten(written(tmp_path), lambda document: document["images"][0].update(mimeType="image/jpeg"))
+    found = inspect_glb(path)
+    assert found.warnings == () and len(found.errors) == len({part.name for part in found.parts if "declared" in part.facts}) > 0
+    assert all("is declared as jpeg, and is png: correct its mimeType" in error for error in found.errors)
+    assert any(part.facts.get("resolution") for part in found.parts if "declared" in part.facts)
+
+
+@pytest.mark.parametrize(("pixel_m", "said"), [(1e-3, False), (10.0, True), (1e-6, True)])
+def test_sizes_of_another_unit_are_asked_about(tmp_path, pixel_m, said):
+    ball = make_ball()
+    camera = ball.camera.model_copy(update={"pixel_size_m": pixel_m})
+    scaled = dataclasses.replace(ball, camera=camera, height=ball.height * (pixel_m / ball.camera.pixel_size_m))
+    path = write_asset(scaled, tmp_path / "a.glb", name="a").path
+    assert any("m large: glTF is in metres" in words for words in inspect_glb(path).warnings) == said
 
 
 @pytest.mark.parametrize(("place", "value", "words"), [

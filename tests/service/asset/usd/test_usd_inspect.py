@@ -326,3 +326,13 @@ def test_faults_of_geometry_and_textures_are_errors(changes, sentence, tmp_path)
     (tmp_path / "text.png").write_text("no picture")
     errors = square(tmp_path / "a.usda", **changes)
     assert len(errors) == (sentence is not None) and all(re.search(str(sentence), error) for error in errors)
+
+
+@pytest.mark.parametrize(("metres", "words"), [(1.0, None), (1000.0, "its metersPerUnit is 1000"), (1e-4, "its metersPerUnit is 0.0001")])
+def test_sizes_of_another_unit_are_asked_about(ball, tmp_path, metres, words):
+    path = tmp_path / "a.usda"
+    write_asset(ball, path, name="a")
+    UsdGeom.SetStageMetersPerUnit(opened := Usd.Stage.Open(str(path)), metres)
+    opened.GetRootLayer().Save()
+    found = [warning for warning in inspect_usd(path).warnings if "m large: " in warning]
+    assert found == [] if words is None else words in found[0]

@@ -183,6 +183,18 @@ def test_an_orthographic_camera_has_depth_equal_to_range(tmp_path):
     np.testing.assert_allclose(maps.depth, 3.0, atol=5e-5)
     points = read_ply(result.points_path).points
     assert np.ptp(points[:, 0]) == pytest.approx(0.05, rel=1e-5) and np.abs(points[:, 2] + 3).max() < 5e-5
+    assert not any("pixel_size_m" in sentence for sentence in result.warnings)
+
+
+def test_pixels_without_a_size_are_said_and_make_no_asset(tmp_path, relit):
+    """The depth is right without it, but a surface would be metres deep and pixels wide."""
+    settings = tof.even((20e6,), 4)
+    view = tof.View(np.full((4, 6), 3.0), np.ones((4, 6)), np.ones((4, 6)))
+    frames = cw_frames(tof.correlations(view, 1e5, settings), settings)
+    result, maps, _ = run(write(tmp_path / "c", frames, camera={"projection": "orthographic", "resolution": [6, 4]}))
+    np.testing.assert_allclose(maps.depth, 3.0, atol=5e-5)
+    assert "camera.pixel_size_m is missing: x and y of points.ply are in pixels, and its z in metres" in result.warnings
+    relit("export", result.depth_path.parent, "--out", tmp_path / "a.usdz").refused("depth.exr: camera.pixel_size_m is missing")
 
 
 def test_no_depth_lies_behind_the_camera(tmp_path):

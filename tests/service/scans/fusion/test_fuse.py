@@ -96,7 +96,7 @@ def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     file.write_text(json.dumps(listed))
     twice = fuse(FuseRequest(scan_set=file, out=tmp_path / "twice", voxel_m=2 * VOXEL, texture=False, device="cpu"))
     assert [w for w in twice.warnings if w not in once.warnings] == [
-        "scan again: holds the same points as view 1, and counts once"]
+        "scan again: holds no points but those of view 1, and counts once"]
     assert twice.mesh_path.read_bytes() == once.mesh_path.read_bytes()
 
 

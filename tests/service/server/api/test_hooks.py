@@ -51,7 +51,10 @@ def test_hooks_are_set_seen_and_deleted_by_admins_of_their_project_alone(keyed, 
 
 @pytest.mark.parametrize(("wanted", "words"), [
     ({"url": "https://127.0.0.1/x"}, "url: 127.0.0.1 is not a public address, and no network of the setting hook_networks has it"),
-    ({"url": "http://93.184.215.14/x"}, "give https://"), ({"url": "https://me:word@tracker.example/"}, "is not of the form"),
+    ({"url": "http://93.184.215.14/x"}, "give https://"),
+    ({"url": "http://tracker.example/x"}, "hook_networks, which this service has none of: give https://"),
+    ({"url": "tracker"}, 'url: is \"tracker\": give https://host/path'),
+    ({"url": "https://me:word@tracker.example/"}, "is not of the form"),
     ({"url": "ftp://tracker.example/"}, "body.url"), ({"url": "https://a b/"}, "body.url"),
     ({"url": "https://tracker.example/", "events": []}, "body.events"),
     ({"url": "https://tracker.example/", "events": ["begun"]}, "body.events")])

@@ -109,7 +109,7 @@ def test_a_key_is_revoked_once(relit, made, data, database):
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["create", "--project", "Larch", "--name", "x", "--scope", "read"], "project"),
+    (["create", "--project", "My Owls", "--name", "x", "--scope", "read"], 'project: is "My Owls": give 1 to 63 of a-z, 0-9 and -'),
     (["create", "--project", "../x", "--name", "x", "--scope", "read"], "project"),
     (["create", "--project", "larch", "--name", "", "--scope", "read"], "name"),
     (["create", "--project", "larch", "--name", "a\nb", "--scope", "read"], "name"),
