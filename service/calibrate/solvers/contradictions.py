@@ -121,7 +121,9 @@ def _other_reading(found: Bundle, device: int, name: str, first: str) -> str | N
     readings: list[tuple[str, str, Reading]] = [
         (f"the columns of {name} counted from the other side", mirrored, lambda corners: [width, 0] + corners * [-1, 1]),
         (f"the rows of {name} counted from the other side", mirrored, lambda corners: [0, height] + corners * [1, -1]),
-        (f"columns and rows of {name} exchanged", "as where its frames are mistaken for each other", lambda corners: corners[:, ::-1])]
+        (f"columns and rows of {name} exchanged", "as where its frames are mistaken for each other", lambda corners: corners[:, ::-1]),
+        (f"the board seen from its other end by {name}", "as where it stands upside down: turn its images by 180°",
+         lambda corners: corners)]
     x, y, _ = np.max([sight.board.max(axis=0) for sight in found.sights], axis=0)
     # corners of a mirrored board are counted from another end too, which is as if it were turned over
     turns = np.zeros(6), np.array([0, np.pi, 0, x, 0, 0]), np.array([np.pi, 0, 0, 0, y, 0]), np.array([0, 0, np.pi, x, y, 0])

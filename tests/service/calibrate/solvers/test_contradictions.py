@@ -114,6 +114,16 @@ def test_a_print_whose_squares_are_none_is_named(aspect, words):
     assert f"with squares that are {words} they fit to 0.0" in said and "measure the print along both sides" in said
 
 
+@pytest.mark.long
+def test_a_camera_that_stands_upside_down_is_named():
+    """The corners of such a camera begin at the other end of the board."""
+    frames = list(tilted(6, 0.4, 4))
+    others = [stereo.alike_order(frame.corners[0], frame.corners[1] * -1 + [800, 600]) for frame in frames]
+    with pytest.raises(CalibrationError, match=r"with the board seen from its other end by right they fit to 0.1. px, as where it stands "
+                                               "upside down: turn its images by 180°"):
+        stereo.calibrate(paired(frames, others), CAMERAS, BOARD, SQUARE)
+
+
 def test_a_negative_focal_length_is_refused():
     every = board_points(BOARD, SQUARE)
     sights = [[Sight(device, number, every, frame.corners[device]) for number, frame in enumerate(tilted(4, 0.4, 0))] for device in (0, 1)]
