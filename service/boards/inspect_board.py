@@ -22,7 +22,7 @@ from service.boards.stitching.overlap import Evidence
 from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over, too_wide
 from service.boards.stitching.significance import Scan, compare, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
-from service.boards.tiles import BoardTiles, read_tiles, without_hidden_outliers
+from service.boards.tiles import BoardTiles, check_lengths, read_tiles, without_hidden_outliers
 from service.depth.base.solution import statistics
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -85,7 +85,7 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
     device = devices.resolve(request.device)
     nominal = _nominal(request)
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
-    stitched = stitch_board(board, request.pixel_m, timings)
+    stitched = stitch_board(board, request.pixel_m, request.placement_m, timings)
     if nominal is None:
         timings.stage("blend", len(board.tiles))
         heights, judged = _levelled(blend(board.tiles, stitched, stitched.grid, progress=timings.advance)), None
@@ -130,8 +130,9 @@ def _nominal(request: InspectBoardRequest) -> Nominal | None:
     return None if request.design is None else read_design(request.design)
 
 
-def stitch_board(board: BoardTiles, pixel_m: float | None, timings: Timings) -> Stitched:
-    """Find where every tile of a board lies; `pixel_m` as in the request."""
+def stitch_board(board: BoardTiles, pixel_m: float | None, placement_m: float | None, timings: Timings) -> Stitched:
+    """Find where every tile of a board lies; `pixel_m` and `placement_m` as in the request."""
+    check_lengths(board, pixel_m=pixel_m, placement_m=placement_m)
     timings.stage("register", REGISTER_STEPS)
     try:
         found = stitch(board.tiles, shift_sigma_m=board.scan.stage_sigma_m, turn_sigma_degrees=board.scan.stage_sigma_degrees,

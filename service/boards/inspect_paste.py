@@ -39,6 +39,10 @@ LEAST_SEEN = 0.5
 """The least part of the pads that must lie within what was measured."""
 LEAST_MARKS, LEAST_PADS = 2, 3
 """The fewest marks, and the fewest pads with paste, that offsets can count from."""
+LEAST_MARK_PX = 4.0
+"""The smallest diameter of a mark, pixels: in a smaller place noise alone looks like a mark."""
+MOST_TURN_DEGREES = 2.0
+"""The largest angle between marks and paste: prints are turned by less, and marks that are none by any angle."""
 
 
 class PadResult(NamedTuple):
@@ -89,7 +93,7 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
     marks = np.zeros((0, 3)) if request.marks is None else read_marks(request.marks) - (*request.origin_m, 0.0)
     marks[:, 0] *= -1 if mirrored else 1
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
-    stitched = stitch_board(board, request.pixel_m, timings)
+    stitched = stitch_board(board, request.pixel_m, request.placement_m, timings)
     search_m = SEARCH_SIGMA * (request.placement_m or SHIFT_SIGMA_PX * stitched.grid.pixel_m)
     heights, warnings = _placed(board, stitched, pads, request, search_m, timings)
     timings.stage("measure", 1)
@@ -183,21 +187,39 @@ def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: Ins
 def _datum(paste: Paste, pads: list[Pad], marks: np.ndarray, request: InspectPasteRequest, search_m: float) -> _Marks:
     """Return what offsets count from: the marks, or most of the paste."""
     grid = paste.height.grid
+    by_paste = _datum_of_paste(paste, pads)
     if len(marks):
-        marks = marks[_on(grid, marks[:, :2])]
+        diameters, marks = marks[:, 2], marks[_on(grid, marks[:, :2]) & (marks[:, 2] >= LEAST_MARK_PX * grid.pixel_m)]
+        if not len(marks) and diameters.max() < LEAST_MARK_PX * grid.pixel_m:
+            raise BoardError(f"{request.marks}: its largest mark is {diameters.max():.2g} m wide, and pixels are {grid.pixel_m:.2g} m: "
+                             "check the unit of the file (METRIC or INCH)")
         offsets = [find_mark(paste.height, mark[:2], mark[2], deep_m=request.stencil_m, search_m=search_m) for mark in marks]
         there = [(mark[:2], offset) for mark, offset in zip(marks, offsets, strict=True) if offset is not None]
         if len(there) < LEAST_MARKS:
             raise BoardError(f"{request.marks}: {len(there)} of its {len(marks)} marks on the board are found within {search_m:.2g} m of "
-                             f"their places, and {LEAST_MARKS} are needed: leave --marks out, and offsets count from most of the paste")
+                             f"their places, and {LEAST_MARKS} are needed: check its unit, or leave --marks out, and offsets count "
+                             "from most of the paste")
         places, moved = np.array(there).swapaxes(0, 1)
-        return _Marks(fit_datum(places, moved, pixel_m=grid.pixel_m), len(there), len(marks))
+        found = fit_datum(places, moved, pixel_m=grid.pixel_m)
+        turn = 0.0 if by_paste is None else abs(float(np.degrees(found.turn - by_paste.turn)))
+        if turn > MOST_TURN_DEGREES:
+            raise BoardError(f"{request.marks}: its marks are turned by {turn:.2g}° against the paste, as where none are what is found at "
+                             "their places: check the unit of the file and --origin-m, or leave --marks out")
+        return _Marks(found, len(there), len(marks))
+    if by_paste is None:
+        raise BoardError(f"{request.board}: fewer than {LEAST_PADS} pads have paste, and {LEAST_PADS} are needed to say where it lies: "
+                         "check --stencil-m")
+    return _Marks(by_paste, 0, 0)
+
+
+def _datum_of_paste(paste: Paste, pads: list[Pad]) -> Datum | None:
+    """Return where most of the paste lies; None where too few pads have any."""
     used = [(pad.centre_m, each.offset_m) for pad, each in zip(pads, paste.pads, strict=True)
             if each is not None and each.values["area_percent"].value > 100 * LEAST_SEEN]
     if len(used) < LEAST_PADS:
-        raise BoardError(f"{request.board}: {len(used)} pads have paste, and {LEAST_PADS} are needed to say where it lies")
+        return None
     places, moved = np.array(used).swapaxes(0, 1)
-    return _Marks(fit_datum(places, moved, pixel_m=grid.pixel_m), 0, 0)
+    return fit_datum(places, moved, pixel_m=paste.height.grid.pixel_m)
 
 
 def _tile_variance(board: BoardTiles, stitched: Stitched, pads: list[Pad]) -> np.ndarray:

@@ -17,6 +17,9 @@ from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.sets.board import SCAN_FILE, BoardScan, Tile
 
+MOST_OF_TILE, MOST_OF_PIXEL = 1 / 3, 10.0
+"""Errors of the stage and of the fixture whose threefold, which is searched, is larger than a tile or a board, and pixels so many times
+larger or smaller than the distance of points, have another unit."""
 SPIKE = 6.0
 """σ beyond its neighbours from which on a point is an outlier."""
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
@@ -50,6 +53,20 @@ def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: 
         contents[tile.path] = maps.provenance.get("relit:inputs", "")
         progress.advance(number + 1)
     return BoardTiles(file, scan, tiles, contents)
+
+
+def check_lengths(board: BoardTiles, *, pixel_m: float | None, placement_m: float | None) -> None:
+    """Check that lengths that are given fit the tiles; those in another unit would search far beyond the board, or need all memory.
+    `pixel_m`, `placement_m`: as of a request. Raises BoardError; it names the field."""
+    widths = [max(np.ptp(tile.x), np.ptp(tile.y)) for tile in board.tiles]
+    tile, apart = float(min(widths)), max(each.pixel_m for each in board.tiles)
+    whole = max(widths) + float(np.ptp([each.middle for each in board.tiles], axis=0).max())
+    for what, given, least, most, beside in (
+            (f"{board.path}: stage_sigma_m", board.scan.stage_sigma_m, 0.0, MOST_OF_TILE * tile, f"tiles are {tile:.3g} m wide"),
+            ("--placement-m", placement_m, 0.0, MOST_OF_TILE * whole, f"the board is {whole:.3g} m wide"),
+            ("--pixel-m", pixel_m, apart / MOST_OF_PIXEL, MOST_OF_PIXEL * apart, f"points of the tiles are {apart:.3g} m apart")):
+        if given is not None and not least <= given <= most:
+            raise BoardError(f"{what}: is {given:g} m, and {beside}: give metres, from {least:.3g} to {most:.3g}")
 
 
 def _maps(file: Path, tile: Tile, device: str | None, cache: Path | None) -> DepthMaps:

@@ -13,7 +13,7 @@ from kernels.status import Status
 from kernels.structured.stripe import KNOWN_REACH, find_stripe
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.calibrate.solvers.charuco import Charuco, charuco_of, find_board
-from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, inside_board
+from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, focal_by_boards, inside_board
 from service.calibrate.solvers.laser_step import fit_step
 from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
 from service.depth.base.triangulation_check import check_perspective
@@ -43,6 +43,10 @@ Along = Literal["row", "column"]
 ALONG: tuple[Along, ...] = ("row", "column")
 
 
+FOCAL_SIGMAS, LEAST_FOCAL = 4.0, 0.005
+"""By how many standard errors, and by what part, the focal length by the boards differs from that of the camera to be said."""
+
+
 class LaserPlanes(NamedTuple):
     """The files that were written, and the planes."""
 
@@ -52,7 +56,7 @@ class LaserPlanes(NamedTuple):
     rows: list[tuple[str, ...]]
     """Frame, tilt and residual of each plane, and its points or how sure depths on it are, the least sure first."""
     warnings: tuple[str, ...]
-    """What was left out."""
+    """What was left out, and a camera that the boards contradict."""
 
 
 class MeasuredPlane(NamedTuple):
@@ -73,6 +77,7 @@ class _OnTarget(NamedTuple):
 
     planes: Sequence[MeasuredPlane | CalibrationError]
     seen: dict[str, Any]
+    said: tuple[str, ...] = ()
 
 
 def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, *,
@@ -112,15 +117,23 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
                                "poses or more")
     frames = _laser_frames(captures[0])
     stripes: list[list[np.ndarray]] = [[] for _ in frames]
-    boards = []
+    boards, every = [], []
     timings.stage("boards", len(captures))
     for number, capture in enumerate(captures, start=1):
-        plane_rms, found = _stripes_on_board(capture, request.board, request.square_m, charuco_of(request), device)
+        plane_rms, found, corners = _stripes_on_board(capture, request.board, request.square_m, charuco_of(request), device)
         boards.append({"capture": str(capture.folder), "rms_px": round(plane_rms, 4), "stripes": sum(len(one) > 0 for one in found)})
+        every.append(corners)
         for index, points in enumerate(found):
             if len(points):
                 stripes[index].append(points)
         timings.advance(number)
+    by_boards = focal_by_boards(every, request.board, request.square_m, captures[0].camera)
+    ratio, sigma = (1.0, 0.0) if by_boards is None else by_boards
+    off = ratio - 1 if abs(ratio - 1) > max(FOCAL_SIGMAS * sigma, LEAST_FOCAL) else 0.0
+    said = () if off == 0 else (
+        f"{captures[0].folder / FILE_NAME}: camera.focal_px: the corners of the boards fit best with {ratio:.3f} times that "
+        f"(σ {sigma:.1g}), as where the camera was refocused since: measure it again with relit calibrate procam or stereo; the standard "
+        "errors of the planes hold the difference",)
     planes: list[MeasuredPlane | CalibrationError] = []
     for index, frame in enumerate(frames):
         try:
@@ -131,14 +144,18 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
                                        ) from error
             planes.append(error)
             continue
+        # depths that are all off by a part move a plane along its normal, and turn it
+        along = abs(float(plane.normal[2]))
+        held = plane._replace(sigma_m=float(np.hypot(plane.sigma_m, off * along * plane.point[2])),
+                              sigma_degrees=float(np.hypot(plane.sigma_degrees, np.degrees(off * along * np.sqrt(max(1 - along**2, 0))))))
         planes.append(MeasuredPlane(
-            plane.point, plane.normal, plane.sigma_m, plane.sigma_degrees,
-            {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points},
+            plane.point, plane.normal, held.sigma_m, held.sigma_degrees,
+            {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{held.sigma_degrees:.3g}"), "points": plane.points},
             (f"{1000 * plane.residual_m:.3f} mm", f"{plane.points} points")))
     failed = [plane for plane in planes if isinstance(plane, CalibrationError)]
     if len(failed) == len(planes):
         raise CalibrationError(f"{captures[0].folder}: frames: no plane is told by the boards: {failed[0]}")
-    return _OnTarget(planes, {"boards": boards})
+    return _OnTarget(planes, {"boards": boards, "focal_by_boards": None if by_boards is None else digits(by_boards)}, said)
 
 
 def _laser_frames(capture: Capture) -> list[Frame]:
@@ -146,8 +163,9 @@ def _laser_frames(capture: Capture) -> list[Frame]:
 
 
 def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, charuco: Charuco | None,
-                      device: str) -> tuple[float, list[np.ndarray]]:
-    """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
+                      device: str) -> tuple[float, list[np.ndarray], np.ndarray]:
+    """Return how well the pose of the board fits, pixels, the points of each stripe on it, [n, 3] metres, none where it is not seen, and
+    its corners, [corners, 2]."""
     correction = Correction.of(capture)
     grey, black = _even_light(capture, correction), _uniform(capture, correction, "black")
     if grey is None:
@@ -164,7 +182,7 @@ def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float,
     stripes = [_stripes(stripe_signal(correction.apply(frame).pixels - dark, inside), albedo, device) for frame in _laser_frames(capture)]
     longer = [max(pair, key=lambda seen: len(seen.lines)) for pair in _whole(stripes, inside)]
     return plane.rms_px, [plane.meet(capture.camera, *seen.image()) if len(seen.lines) >= LEAST_LINES else np.zeros((0, 3))
-                          for seen in longer]
+                          for seen in longer], corners
 
 
 def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Timings) -> _OnTarget:
@@ -303,5 +321,5 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Pat
     measured = sorted(((name, plane) for name, plane in named if isinstance(plane, MeasuredPlane)),
                       key=lambda pair: pair[1].sigma_degrees, reverse=True)
     rows: list[tuple[str, ...]] = [(name, f"{plane.sigma_degrees:.3f}°", *plane.words) for name, plane in measured]
-    return LaserPlanes(paths, reports[0], rows, tuple(f"frames of {name}: {plane}; they are left out" for name, plane in named
-                                                      if isinstance(plane, CalibrationError)))
+    return LaserPlanes(paths, reports[0], rows, (*found.said, *(f"frames of {name}: {plane}; they are left out" for name, plane in named
+                                                                if isinstance(plane, CalibrationError))))

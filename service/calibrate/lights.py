@@ -17,6 +17,17 @@ from service.calibrate.balls import (
     find_mirror_balls,
     still_on,
 )
+from service.calibrate.light_faults import (
+    ALIEN,
+    LEAST_ALIEN,
+    as_unsure_as_rays_miss,
+    at_one_place,
+    beside,
+    missing_sentence,
+    with_beside,
+    with_clipped,
+    with_wide_spots,
+)
 from service.calibrate.results import (
     LightCalibration,
     LightCaptures,
@@ -29,7 +40,7 @@ from service.calibrate.results import (
 )
 from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
 from service.calibrate.solvers.lamp_faults import encoding_flag
-from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_point
+from service.calibrate.solvers.mirror_ball import find_spot, nearest_point
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, dark_side, fit_brightness, fit_direction
@@ -51,12 +62,8 @@ ANALYSER_GAIN = 2.0
 """Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""
 READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
-ALIEN, LEAST_ALIEN = 5.0, 0.02
-"""Residual of a light, over the median of all and relative to readings, from which it contradicts the others; 2 where none does."""
 UNSURE = 0.05
 """Median uncertainty of the brightness of lights, relative, from which the object is said to be none to measure them on."""
-WIDE = 2.0
-"""The size of the spot of a lamp over the median of all, from which something beside the lamp may be a part of it."""
 ROOM_LIGHT = 0.03
 """Light on the dark side of a ball or an object, over that where it faces a lamp, from which on it is said; dark rooms give one or two
 percent."""
@@ -96,24 +103,10 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
 
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=True),
                                  drop_failed=request.drop_failed)
-    results = _with_wide_spots(results)
+    results = with_wide_spots(results)
     timings.close()
     return write_lights("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
-                        summary={"balls": [ball_entry(ball)]}, warnings=warnings)
-
-
-def _with_wide_spots(results: Sequence[MeasuredLight]) -> list[MeasuredLight]:
-    """Return lights measured on a mirror ball, as unsure as their spot is wide where it is wider than those of the other lights: what
-    stands beside a lamp and mirrors it may be a part of such a spot."""
-    sizes = [result.entry["spot_degrees"] for result in results if result.light is not None]
-    held = []
-    for result in results:
-        if result.light is not None and result.entry["spot_degrees"] > WIDE * float(np.median(sizes)):
-            doubt = float(np.hypot(result.doubt, result.entry["spot_degrees"]))
-            entry = {**result.entry, "uncertainty_degrees": round(doubt, 4), "flags": [*result.entry["flags"], "wider than the others"]}
-            result = result._replace(entry=entry, row=(result.row[0], f"{doubt:.2f}°", *result.row[2:]), doubt=doubt)
-        held.append(result)
-    return held
+                        summary={"balls": [ball_entry(ball)]}, warnings=[*warnings, *at_one_place(captures, results)])
 
 
 def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> LightCalibration:
@@ -140,20 +133,22 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
                               np.array([spot.uncertainty_degrees for spot in spots]))
         flags = [*found.flags, *(f"ball {n}: {flag}" for n, spot in enumerate(spots, start=1) for flag in spot.flags)]
         entry = {"position_m": digits(found.position), "residual_m": float(f"{found.residual:.3g}"),
-                 "uncertainty_m": float(f"{found.uncertainty:.3g}"), "flags": flags}
+                 "uncertainty_m": float(f"{found.uncertainty:.3g}"), "excess": float(f"{found.excess:.3g}"), "flags": flags}
         row = (three_numbers(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
         return MeasuredLight(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
 
     results = leave_out_failures(captures, _measure_each(captures, views, measure, timings, mirrors=True),
                                  drop_failed=request.drop_failed)
     timings.close()
-    missed = sum(MISSES in result.entry["flags"] for result in results)
-    if not named and 2 * missed > len(results):
+    results = as_unsure_as_rays_miss(results)
+    missing = missing_sentence(results)
+    if not named and missing:
         raise CalibrationError(f"{captures.source.folder}: the reflections in the {len(balls)} round outlines that were found do not meet "
-                               f"in {missed} of {len(results)} frames: not all of them are mirror balls of this size; name the balls with "
-                               "--ball U,V,R or --ball-mask FILE")
+                               "in most frames: not all of them are mirror balls of this size; name the balls with --ball U,V,R or "
+                               "--ball-mask FILE")
     return write_lights("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
-                        summary={"balls": [ball_entry(ball) for ball in balls]}, warnings=warnings)
+                        summary={"balls": [ball_entry(ball) for ball in balls]},
+                        warnings=[*warnings, *missing, *at_one_place(captures, results)])
 
 
 def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures) -> list[Ball]:
@@ -193,20 +188,23 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
 
     def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
         patch, light, entry = patches[0], lit.light, {}
+        saturated, flags = with_clipped(patch.radiance, patch.saturated, view)
         if request.refine_direction:
-            shading = fit_direction(patch.radiance, patch.saturated, view)
+            shading = fit_direction(patch.radiance, saturated, view)
             light = as_direction(light, shading.direction)
             turned = np.degrees(ball.outline_error_px / ball.radius_px)  # normals are, and the direction with them
             sure_to = float(np.hypot(shading.uncertainty_degrees, turned))
             entry = {"direction": digits(shading.direction), "uncertainty_degrees": round(sure_to, 4)}
-        found = fit_brightness(patch.radiance, patch.saturated, light, view)
+        found = fit_brightness(patch.radiance, saturated, light, view)
         declared = captures.source.manifest.color_space
-        other = better_encoding(patch.radiance, patch.saturated, light, view, exposure=lit.frame.exposure_s or 1.0, declared=declared,
+        other = better_encoding(patch.radiance, saturated, light, view, exposure=lit.frame.exposure_s or 1.0, declared=declared,
                                 residual=found.residual)
-        flags = ["not Lambertian under this light"] if found.residual > 0.1 else []
+        flags += ["not Lambertian under this light"] if found.residual > 0.1 else []
         if other is not None:
             flags = [encoding_flag(declared, *other, found.residual)]
-        room = dark_side(patch.radiance, patch.saturated, light, view, found.scale)
+        else:
+            entry |= beside(patch.radiance, saturated, light, ball, view)
+        room = dark_side(patch.radiance, saturated, light, view, found.scale)
         scale = found.scale * (ANALYSER_GAIN if light.polarization != "none" else 1)
         entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels,
                   "dark_side": None if room is None else round(room, 4), "flags": flags}
@@ -215,6 +213,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=False),
                                  drop_failed=request.drop_failed)
     timings.close()
+    results, said = with_beside(captures, results)
     told = [result.entry for result in results if result.light is not None and result.entry["dark_side"] is not None]
     fitting = [entry for entry in told if not entry["flags"]] or told  # a light from elsewhere than declared reaches that side
     room_light = float(np.median([entry["dark_side"] for entry in fitting])) if fitting else 0.0
@@ -223,7 +222,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
                                "camera, which makes irradiances and directions wrong: add a frame of type off, or a dark image"]
     return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
                         headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None,
-                        warnings=warnings)
+                        warnings=[*warnings, *said])
 
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],
@@ -231,7 +230,7 @@ def _measure_each(captures: LightCaptures, views: Sequence[BallView],
                   timings: Timings, *, mirrors: bool) -> list[MeasuredLight | CalibrationError]:
     """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured.
     `mirrors`: whether the balls show the room, of which the patches then say what stands still."""
-    correction = Correction.of(captures.source)
+    correction = Correction.of(captures.source, full_scale=not mirrors)
     still = still_on(captures, correction, views) if mirrors else [None] * len(views)
 
     def one(lit: LitFrame) -> MeasuredLight | CalibrationError:
@@ -297,7 +296,7 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
         raise CalibrationError(f"{source.folder / FILE_NAME}: frames: {error}") from error
     inside = np.flatnonzero(source.mask())
     chosen = np.random.default_rng(0).choice(inside, min(request.pixels, len(inside)), replace=False)
-    correction = Correction.of(source)
+    correction = Correction.of(source, full_scale=True)
     timings.stage("frames", len(captures.lit))
     readings, usable = np.empty((len(captures.lit), len(chosen), 3)), np.ones((len(captures.lit), len(chosen)), dtype=bool)
     for number, lit in enumerate(captures.lit):

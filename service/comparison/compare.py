@@ -112,7 +112,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
                          least_seen=request.least_seen, one_pose=not placement.rivals)
     size = size_of(patches, placement.pivot)
-    warnings = _warnings(scan, placement, found, size)
+    warnings = _warnings(scan, placement, found, size, by_datum=any(region.datum for region in regions))
     if design.turned_edges:
         warnings.append(f"{request.design}: at {design.turned_edges} edges its faces turn their fronts opposite ways: points at faces that "
                         "are turned inward are not compared; make its normals consistent")
@@ -184,7 +184,7 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(cKDTree(points).query(chosen, k=NEIGHBOUR + 1)[0][:, NEIGHBOUR]))
 
 
-def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations, size: Size | None) -> list[str]:
+def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations, size: Size | None, *, by_datum: bool) -> list[str]:
     warnings = []
     if size is not None:
         warnings.append(f"the scan is {size.factor:.5f} times as large as the design (± {size.sigma:.1g}), as where the calibration of the "
@@ -192,7 +192,9 @@ def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations, siz
     if placement.rivals:
         warnings.append(f"{placement.rivals} other poses fit about as well, as of a part that looks the same when it is turned: regions "
                         "may be those of another side, and none is decided; place the scan roughly, and give --align refine")
-    if placement.held:
+    if placement.held and by_datum:
+        warnings.append(f"the datum regions leave {placement.held} of 6 motions of the scan open: they are as the whole surface has them")
+    elif placement.held:
         warnings.append(f"the surface leaves {placement.held} of 6 motions of the scan open, as that of a cylinder about its axis: they "
                         "stay as they are, and what is shifted along the surface is not seen")
     if (far := 1 - len(found.near) / len(scan.points)) > FAR:

@@ -6,6 +6,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from service.requests.base.base import Choice, Commas, DeviceRequest, Options, Role, Spelling
+from service.requests.base.option_values import StencilThickness
 from stage.model import Finite, Fraction, NotNegative, Positive, Text
 
 
@@ -101,7 +102,7 @@ class InspectPasteRequest(DeviceRequest):
     """The paste layer (Gerber): the openings of the stencil."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for board.exr, pads.csv, inspection.png and report.json."""
-    stencil_m: Positive
+    stencil_m: Annotated[Positive, StencilThickness]
     """Thickness of the stencil in metres."""
     side: BoardSide = BoardSide.TOP
     """The side of the board."""

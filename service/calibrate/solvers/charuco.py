@@ -26,6 +26,8 @@ LEAST_MARKERS = 4
 SMALL_PX = 30.0
 """Side of markers in pixels, below which they are looked for in the image at twice its size too: OpenCV reads 4 to 8 of 35 markers of 12
 pixels, and 23 to 31 of them so."""
+LEAST_INNER = 3
+"""The fewest inner corners across and down of a board that OpenCV finds."""
 LEAST_SEEN = 8
 """The fewest corners of a view: their positions on the board then hold its pose twice over."""
 PLACE_OF_SQUARE = 0.25
@@ -58,7 +60,12 @@ def find_board(image: np.ndarray, board: tuple[int, int], charuco: Charuco | Non
     if charuco is not None:
         return _find_charuco(eight_bits(image), board, charuco)
     corners = find_corners(image, board)
-    return f"the board of {board[0]}x{board[1]} inner corners is not found" if corners is None else corners
+    if corners is not None:
+        return corners
+    missing, inner = f"the board of {board[0]}x{board[1]} inner corners is not found", (board[0] - 1, board[1] - 1)
+    if min(inner) < LEAST_INNER or find_corners(image, inner) is None:
+        return missing
+    return f"{missing}, but one of {inner[0]}x{inner[1]} is: --board counts inner corners, one fewer than squares"
 
 
 def _find_charuco(shown: np.ndarray, board: tuple[int, int], charuco: Charuco) -> np.ndarray | str:

@@ -1,7 +1,8 @@
 """Devices that contradict each other: each fits the boards alone, and together they do not.
 
 The reasons are those that the corners of one device alone do not show: a device that was moved, turned or refocused between the views,
-views whose images are not of one moment or were exchanged, and images that are mirrored. A board that is bent is another one.
+views whose images are not of one moment or were exchanged, and images that are mirrored. A board that is bent, or whose squares are none,
+is another one.
 
 Convention: as bundle.py.
 """
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 
 from service.calibrate.solvers.bundle import Alone, Bundle, Sight, adjust, after, alone, inverse
+from stage.errors import CalibrationError
 
 CONTRADICTED, AGREED = 4.0, 2.0
 """`Bundle.excess` from which devices contradict each other, and up to which they do not. Noise gives 1.6 at most in 40 calibrations, and
@@ -20,6 +22,8 @@ MISREAD = 100.0
 """`Bundle.excess` from which other readings of the images are tried: images that are mirrored leave 100 000 and more."""
 LEAST_VIEWS = 3
 """Views that must agree, for the others to be named."""
+ASPECT, MOST_ASPECT = 0.01, 0.05
+"""By how much taller squares are tried to be than wide, and the most by which prints are: a print is scaled by a few percent at most."""
 ALIKE = 2.0
 """Readings fit alike whose views agree to within this many times the best one's pixels."""
 Reading = Callable[[np.ndarray], np.ndarray]
@@ -36,6 +40,9 @@ def contradiction(found: Bundle, names: Sequence[str], views: Sequence[str]) -> 
             reading = _other_reading(found, device, names[device], names[0])
             if reading is not None:
                 return f"{said}; {reading}"
+    taller = _other_aspect(found, names)
+    if taller is not None:
+        return f"{said}; {taller}"
     odd = [views[view] for view in _odd_views(found)]
     which = f"; without {', '.join(odd)} they do not" if odd else ""
     return (f"{said}{which}: check that nothing moved or was refocused between the views, that the images of a view are of one moment, and "
@@ -44,6 +51,32 @@ def contradiction(found: Bundle, names: Sequence[str], views: Sequence[str]) -> 
 
 def _listed(words: Sequence[str]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _other_aspect(found: Bundle, names: Sequence[str]) -> str | None:
+    """Return by how much the squares of the board are taller than wide, if nothing is contradicted then; None where that is not so."""
+
+    def fitted(aspect: float) -> Bundle:
+        sights = [sight._replace(board=sight.board * [1, aspect, 1]) for sight in found.sights]
+        own = [[sight for sight in sights if sight.device == device] for device in range(len(found.alone))]
+        return adjust(sights, [alone(seen, device.size, name) for seen, device, name in zip(own, found.alone, names, strict=True)])
+
+    aspect = 1.0
+    try:
+        for step in (ASPECT, ASPECT / 4):
+            below, at, above = (fitted(aspect + times * step).rms_px() ** 2 for times in (-1, 0, 1))
+            bend = below - 2 * at + above
+            if not bend > 0:
+                return None
+            aspect += step * float(np.clip((below - above) / (2 * bend), -3, 3))
+        best = fitted(aspect)
+    except CalibrationError:  # boards of another form determine no lens
+        return None
+    if not (abs(aspect - 1) < MOST_ASPECT and best.excess < AGREED):
+        return None
+    form = f"{100 * abs(aspect - 1):.2g} % {'taller than wide' if aspect > 1 else 'wider than tall'}"
+    return (f"with squares that are {form} they fit to {best.rms_px():.2g} px: measure the print along both sides, and print it without "
+            "scaling")
 
 
 def _odd_views(found: Bundle) -> list[int]:
@@ -88,7 +121,9 @@ def _other_reading(found: Bundle, device: int, name: str, first: str) -> str | N
     readings: list[tuple[str, str, Reading]] = [
         (f"the columns of {name} counted from the other side", mirrored, lambda corners: [width, 0] + corners * [-1, 1]),
         (f"the rows of {name} counted from the other side", mirrored, lambda corners: [0, height] + corners * [1, -1]),
-        (f"columns and rows of {name} exchanged", "as where its frames are mistaken for each other", lambda corners: corners[:, ::-1])]
+        (f"columns and rows of {name} exchanged", "as where its frames are mistaken for each other", lambda corners: corners[:, ::-1]),
+        (f"the board seen from its other end by {name}", "as where it stands upside down: turn its images by 180°",
+         lambda corners: corners)]
     x, y, _ = np.max([sight.board.max(axis=0) for sight in found.sights], axis=0)
     # corners of a mirrored board are counted from another end too, which is as if it were turned over
     turns = np.zeros(6), np.array([0, np.pi, 0, x, 0, 0]), np.array([np.pi, 0, 0, 0, y, 0]), np.array([0, 0, np.pi, x, y, 0])

@@ -22,6 +22,12 @@ LARGEST_SIGMA_DEGREES = 1.0
 ROUNDS, CAUCHY = 20, 1.5
 """Rounds of re-weighting of a plane, and the scale of its Cauchy weights in standard deviations."""
 LEAST_POINTS = 20
+UNIT_PX = 1000.0
+"""Focal length of the camera without distortion in whose image corners are compared; any will do."""
+
+
+LEAST_BOARDS = 3
+"""Boards from which a focal length follows."""
 
 
 class BoardPlane(NamedTuple):
@@ -73,6 +79,31 @@ def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, ca
     to_camera = OPENCV_FROM_CAMERA.T
     point, normal = to_camera @ shift.ravel(), to_camera @ rotation[:, 2]
     return BoardPlane(point, normal if normal @ point < 0 else -normal, float(np.sqrt((off**2).sum(axis=1).mean())))
+
+
+def focal_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> tuple[float, float] | None:
+    """Return the focal length of a camera by which boards fit best, over its own, and the standard deviation of that ratio; the rest of the
+    lens stays. None from fewer than three boards, or where they do not tell. `corners`, `board`: as of `board_plane`, of each board."""
+    if len(corners) < LEAST_BOARDS:
+        return None
+    across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
+    every = (np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m).astype(np.float32)
+    points, seen = [], []
+    for own in corners:
+        known = np.isfinite(own).all(axis=-1)
+        x, y = camera.plane_at(*own[known].T)
+        points.append(every[known])
+        seen.append((UNIT_PX * np.stack([x, -y], axis=1)).astype(np.float32))
+    matrix = np.diag([UNIT_PX, UNIT_PX, 1.0])
+    fixed = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    try:
+        _, found, _, _, _, spread, _, _ = cv2.calibrateCameraExtended(
+            points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), matrix, np.zeros(5),
+            flags=fixed | cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
+    except cv2.error:
+        return None
+    ratio, sigma = float(found[0, 0]) / UNIT_PX, float(spread.max()) / UNIT_PX
+    return (ratio, sigma) if np.isfinite([ratio, sigma]).all() and ratio > 0 else None
 
 
 def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:

@@ -202,6 +202,8 @@ class Position(NamedTuple):
     """The root mean square distance from the rays, in the unit of the balls."""
     uncertainty: float
     """The standard error of the position in the unit of the balls, propagated from the uncertainty of the rays."""
+    excess: float
+    """The squares by which the rays miss each other, relative to what their uncertainty explains: 1 but for chance."""
     flags: tuple[str, ...]
 
 
@@ -230,5 +232,6 @@ def nearest_point(
     spread = np.radians(uncertainty_degrees) * distance
     inverse = np.linalg.inv(normal)
     covariance = inverse @ (across * (spread**2)[:, None, None]).sum(axis=0) @ inverse
+    excess = float(((miss / spread) ** 2).sum()) / (2 * len(points) - 3)
     flags = (MISSES,) if np.degrees(np.arctan2(miss, distance)).max() > MISS_DEGREES else ()
-    return Position(position, float(np.sqrt((miss**2).mean())), math.sqrt(float(np.trace(covariance))), flags)
+    return Position(position, float(np.sqrt((miss**2).mean())), math.sqrt(float(np.trace(covariance))), excess, flags)

@@ -10,6 +10,8 @@ from stage.model import Finite, Positive
 
 LARGEST_SQUARE_M = 1.0
 """The largest side of a square of a chessboard, metres: larger numbers are millimetres."""
+THICKEST_STENCIL_M = 2e-3
+"""The thickest stencil of solder paste, several times what is sold, metres: larger numbers are millimetres or micrometres."""
 
 
 def refuse(sentence: str) -> NoReturn:
@@ -73,10 +75,12 @@ def _corners(given: Any) -> Any:
     return tuple(map(int, parts))
 
 
-def _in_metres(given_m: float | None, *, option: str, what: str) -> Any:
-    """Return a length, which is refused where it seems to be in millimetres."""
-    if given_m is not None and given_m > LARGEST_SQUARE_M:
-        refuse(f"{option} {given_m:g}: is {given_m:g} m, more than {what} has: give metres, such as {given_m / 1000:g} for {given_m:g} mm")
+def _in_metres(given_m: float | None, *, option: str, what: str, most_m: float = LARGEST_SQUARE_M) -> Any:
+    """Return a length, which is refused where it seems to be in millimetres or micrometres."""
+    if given_m is not None and given_m > most_m:
+        part, unit = (1e-3, "mm") if 1e-3 * given_m <= most_m else (1e-6, "µm")
+        refuse(f"{option} {given_m:g}: is {given_m:g} m, more than {what} has: "
+               f"give metres, such as {part * given_m:g} for {given_m:g} {unit}")
     return given_m
 
 
@@ -95,3 +99,4 @@ LevelsText = BeforeValidator(_levels)
 SquareSide = AfterValidator(partial(_in_metres, option="--square-m", what="a square of a chessboard"))
 MarkerSide = AfterValidator(partial(_in_metres, option="--marker-m", what="a marker"))
 StepHeight = AfterValidator(partial(_in_metres, option="--step-m", what="a step"))
+StencilThickness = AfterValidator(partial(_in_metres, option="--stencil-m", what="a stencil", most_m=THICKEST_STENCIL_M))

@@ -186,6 +186,7 @@ def test_a_golden_map_that_does_not_fit_is_one_sentence(relit, tmp_path, golden,
     ({"tiles": [{"path": "tile_00"}]}, "position_m is missing, and so is world_from_camera"),
     ({"tiles": [{"path": "nothing", "position_m": [0, 0]}]}, "nothing holds neither depth.exr nor capture.json"),
     ({"stage_sigma": 1e-5}, "stage_sigma: is not a known key"),
+    ({"stage_sigma_m": 20}, "stage_sigma_m: is 20 m, and tiles are 0.00"),  # micrometres: a search over 900 TiB
 ])
 def test_a_bad_board_file_is_one_sentence(relit, tmp_path, change, words):
     folder = board(tmp_path / "b", SURFACE, seed=7, across=1, down=1)

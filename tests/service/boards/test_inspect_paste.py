@@ -89,6 +89,12 @@ def test_marks_tell_an_offset_of_the_whole_print(relit, tmp_path):
     wrong = relit("inspect-paste", board, "--paste", layer, "--stencil-m", THICK, "--out", tmp_path / "o", "--device", "cpu", "--marks",
                   write_drill(tmp_path / "other.drl", [(0.0, -8.2e-4), (0.0, 0.0)], BORE))
     assert wrong.code == 2 and "0 of its 2 marks on the board are found" in wrong.err and not (tmp_path / "o").exists()
+    # inches declared as millimetres: every mark was found, one pixel wide, in noise; others in the flanks of paste, turned by degrees
+    for factor, words in ((1 / 25.4, "marks.drl: its largest mark is 1e-05 m wide"), (0.4, "of its 3 marks|its marks are turned by")):
+        marks = write_drill(tmp_path / "marks.drl", [(factor * x, factor * y) for x, y in HOLES], factor * BORE)
+        refused = relit("inspect-paste", board, "--paste", layer, "--stencil-m", THICK, "--out", tmp_path / "o", "--device", "cpu",
+                        "--marks", marks)
+        assert refused.code == 2 and re.search(words, refused.err) and not (tmp_path / "o").exists(), refused.err
 
 
 def test_a_board_that_lies_on_its_face_and_elsewhere_is_the_same(relit, tmp_path):
@@ -123,6 +129,10 @@ def test_classes_of_limits_and_pads_without_any(relit, tmp_path):
     (("--limits", "LIMITS", "--limit-class", "six"), "has no class six"),
     (("--limit-class", "one"), "limit_class is given without limits"),
     (("--origin-m", "1,1"), "lie beyond what was measured"),
+    (("--stencil-m", "0.11"), "--stencil-m 0.11: is 0.11 m, more than a stencil has: give metres, such as 0.00011 for 0.11 mm"),
+    (("--stencil-m", "110"), "such as 0.00011 for 110 µm"),
+    (("--placement-m", "0.1"), "--placement-m: is 0.1 m, and the board is 0.003"),
+    (("--pixel-m", "0.012"), "--pixel-m: is 0.012 m, and points of the tiles are 1.2e-05 m apart"),
     (("--origin-m", "0.0004,0.0004"), "does not lie as the openings do"),
     (("--centroids", "PLACES"), "of its components lie beyond the pads"),
 ])
@@ -130,7 +140,8 @@ def test_what_does_not_fit_is_one_sentence(relit, tmp_path, more, words):
     files = {"LIMITS": limits(tmp_path / "limits.json", one=WIDE, two=WIDE), "PLACES": tmp_path / "places.csv"}
     files["PLACES"].write_text("Ref,PosX,PosY\nU1,100,100\n")
     board, layer = printed(tmp_path / "b", surface(Print()), 6), write_layer(tmp_path / "paste.gbr")
-    outcome = relit("inspect-paste", board, "--paste", layer, "--stencil-m", THICK, "--out", tmp_path / "o", "--device", "cpu",
+    thick = () if "--stencil-m" in more else ("--stencil-m", THICK)
+    outcome = relit("inspect-paste", board, "--paste", layer, *thick, "--out", tmp_path / "o", "--device", "cpu",
                     *(files.get(word, word) for word in more))
     assert outcome.code == 2 and words in outcome.err and not (tmp_path / "o").exists(), outcome.err
 

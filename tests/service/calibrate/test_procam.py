@@ -132,6 +132,8 @@ def test_what_is_wrong_is_said(relit, rig, tmp_path):
     given = "--square-m", 0.03, "--board"
     assert "2 of the views can be used" in refused(*folders[:2], *given, "9x6", "--projector", "256x192")
     assert "is not found (and so with every view)" in refused(folders[0], *given, "12x9", "--projector", "256x192")
+    assert "10x7 inner corners is not found, but one of 9x6 is: --board counts inner corners" in refused(
+        folders[0], *given, "10x7", "--projector", "256x192")
     assert "--board 9: give two whole numbers" in refused(folders[0], *given, "9")
     said = refused(folders[0], "--square-m", 75, "--board", "9x6")
     assert said.startswith("relit: --square-m 75: is 75 m, ") and "0.075 for 75 mm" in said and said.count("\n") == 1

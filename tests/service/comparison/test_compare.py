@@ -114,6 +114,7 @@ def test_a_datum_carries_the_scan(tmp_path, part):
     plate, boss = result.regions
     assert boss.mean_m == pytest.approx(5e-5, abs=4 * SIGMA_M / np.sqrt(500)) and abs(plate.mean_m) < 4 * SIGMA_M / np.sqrt(5000)
     assert reported(result)["placement"]["open_motions"] == 3  # a plane leaves two shifts and a turn open
+    assert any("the datum regions leave 3 of 6 motions" in said for said in result.warnings)  # not the surface, as that of a cylinder
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.003])

@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.calibrate import stereo
 from service.calibrate.solvers.bundle import Sight, adjust, alone
 from service.calibrate.solvers.procam import BoardView, board_points, calibrate
 from service.calibrate.stereo import BoardFrame
 from stage.errors import CalibrationError
-from tests.service.calibrate.solvers.test_procam import BOARD, CAMERAS, SQUARE, depth_error, tilted
+from tests.reference import projector as reference
+from tests.service.calibrate.solvers.test_procam import BOARD, CAMERA, CAMERAS, POSE, PROJECTOR, SQUARE, depth_error, tilted
 
 SIZES = (400, 300), (800, 600)
 
@@ -93,6 +95,32 @@ def test_a_mirrored_camera_whose_corners_are_found_from_the_other_end_is_named()
     frames = list(tilted(6, 0.4, 4))
     others = [(frame.corners[1] * [-1, 1] + [800, 0]).reshape(BOARD[1], BOARD[0], 2)[:, ::-1].reshape(-1, 2) for frame in frames]
     with pytest.raises(CalibrationError, match=r"with the columns of right counted from the other side they fit to 0.1. px"):
+        stereo.calibrate(paired(frames, others), CAMERAS, BOARD, SQUARE)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("aspect", "words"), [(1.01, "1 % taller than wide"), (0.985, "1.5 % wider than tall")])
+def test_a_print_whose_squares_are_none_is_named(aspect, words):
+    """Depths were wrong by twice what was stated where the board stays upright, and by 4 % where it is turned in its plane."""
+    random, frames = np.random.default_rng(3), []
+    for number in range(8):
+        turn = Rotation.from_euler("zyx", random.uniform(-0.5, 0.5, 3) * [0.4, 1, 1]).as_matrix()
+        own = board_points(BOARD, SQUARE) - [SQUARE * (BOARD[0] - 1) / 2, SQUARE * (BOARD[1] - 1) / 2, 0]
+        points = own * (1, -aspect, 1) @ turn.T + random.uniform((-0.08, -0.06, -1.0), (0.08, 0.06, -0.8))
+        seen = reference.project(CAMERA, points), reference.seen_by(PROJECTOR, POSE, points)
+        frames.append(BoardFrame(str(number), tuple(corners + random.normal(0, 0.05, corners.shape) for corners in seen)))
+    _, (other,) = stereo.calibrate(frames, CAMERAS, BOARD, SQUARE)
+    said = str(other.certainty.contradiction)
+    assert f"with squares that are {words} they fit to 0.0" in said and "measure the print along both sides" in said
+
+
+@pytest.mark.long
+def test_a_camera_that_stands_upside_down_is_named():
+    """The corners of such a camera begin at the other end of the board."""
+    frames = list(tilted(6, 0.4, 4))
+    others = [stereo.alike_order(frame.corners[0], frame.corners[1] * -1 + [800, 600]) for frame in frames]
+    with pytest.raises(CalibrationError, match=r"with the board seen from its other end by right they fit to 0.1. px, as where it stands "
+                                               "upside down: turn its images by 180°"):
         stereo.calibrate(paired(frames, others), CAMERAS, BOARD, SQUARE)
 
 
