@@ -45,7 +45,8 @@ class DirectLight(NamedTuple):
     """None: no interreflection is taken out."""
     albedo: np.ndarray  # [3, pixels] of the light that other surfaces send, at the normals from which all this follows
     albedo_scale: float = 1.0
-    """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
+    """Light that other surfaces send over that which this albedo and the form factors give: albedo is relative where the scale of the
+    lights is, and gloss and surfaces out of sight send light too."""
 
     @property
     def found(self) -> tuple[object, ...]:

@@ -196,13 +196,15 @@ class _Walk:
         if light is None or light.arriving is None or not self._options.settling:
             return light
         middles = middles_of(light, self._pick)
-        light, shown = as_shown(light, self.result.normal, middles)
+        light, shown = as_shown(light, self.result.normal, self._shape, self._pick, middles)
+        told = self.result.facts["bounced_light"] = {"taken_out": light.arriving is not None}
         if shown is not None:
-            self.result.facts["bounced_light"] = {"shown": round(shown, 3), "taken_out": light.arriving is not None}
+            told["shown"] = round(shown, 3)
         if light.arriving is None or self._field is not None or not self._supported:
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
         settled = settle(light, self.result.normal, self._shape, self._pick, middles, relative=relative)
+        told["strength"] = round(settled.light.albedo_scale, 3)
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
         return settled.light

@@ -88,9 +88,9 @@ def test_few_shadows_show_nothing():
 ALBEDO, SCALE, SIDE = 0.8, 2.5, 28
 
 
-def groove_capture(folder, *, scale: float, declared: str | None, bounced: bool = True):
+def groove_capture(folder, *, scale: float, declared: str | None, bounced: bool = True, widest: float = 70.0):
     """A groove, with all bounces or none, under 40 lights whose irradiance is declared `scale` times too large."""
-    lights = cap(40, 70.0)
+    lights = cap(40, widest)
     whole, direct = Groove(SIDE).radiance(lights, ALBEDO)
     return write_lit(folder, (whole if bounced else direct).reshape(-1, SIDE, SIDE), [distant(light, scale) for light in lights],
                      camera={"projection": "orthographic", "resolution": [SIDE, SIDE]},
@@ -124,10 +124,10 @@ def test_the_scale_is_found_and_reported(by_declaration):
 
 
 def test_normals_are_free_of_the_bounce(by_declaration):
-    """Under the declared scale, a part of the bounce stays in the readings, and opens the groove by degrees."""
-    (_, right, _), (_, left, _) = by_declaration["relative"], by_declaration["absolute"]
-    assert np.median(left) > 4
-    assert np.median(right) < 0.4 * np.median(left)
+    """With the bounce that the declared lights let expect, the groove would be open by 4°; patches at its seam exchange too little."""
+    for _, error, report in by_declaration.values():
+        assert report["found"]["bounced_light"]["strength"] == pytest.approx(SCALE, rel=0.15)
+        assert np.median(error) < 1.5
 
 
 def test_bounced_light_is_no_gloss(by_declaration):
@@ -149,7 +149,7 @@ def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):
     assert "albedo_scale" not in report["found"]
     result, error, report = solved(groove_capture(tmp_path, scale=1.0, declared=None), tmp_path / "out")
     assert report["inputs"]["irradiance_scale"] == "absolute"
-    assert np.median(error) < 0.4 * np.median(by_declaration["absolute"][1])
+    assert np.median(error) < 1.5  # as above
     assert np.median(result.maps.diffuse_albedo) == pytest.approx(ALBEDO, rel=0.1)
 
 
@@ -159,6 +159,16 @@ def test_no_bounce_is_taken_out_of_images_without(declared, tmp_path):
     _, error, report = solved(groove_capture(tmp_path, scale=1.0, declared=declared, bounced=False), tmp_path / "out")
     assert not report["found"]["bounced_light"]["taken_out"]
     assert np.median(error) < 0.1  # half floats and 40 lights without noise
+
+
+@pytest.mark.parametrize("bounced", [False, True])
+def test_lit_readings_tell_where_no_shadow_does(bounced, tmp_path):
+    """Lights within 40° reach both sides of a right-angled groove. With the bounce that images lack taken out, its median is 15° off."""
+    _, error, report = solved(groove_capture(tmp_path, scale=1.0, declared=None, bounced=bounced, widest=40.0), tmp_path / "out")
+    found = report["found"]["bounced_light"]
+    assert "shown" not in found
+    assert found["taken_out"] == bounced
+    assert np.median(error) < (1.5 if bounced else 0.1)  # as above
 
 
 def test_bounce_is_taken_out_of_images_with_it(by_declaration):
