@@ -43,7 +43,7 @@ from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.settling import as_shown, middles_of, settle
-from service.solve.methods.support import FEW_LIGHTS, support_of
+from service.solve.methods.support import FEW_LIGHTS, simpler_normals, support_of
 from service.solve.methods.unseen_metals import replace_unseen_metals
 from stage.colour.colour import GREY_WEIGHTS
 
@@ -118,7 +118,7 @@ class _Walk:
         self._simple = np.zeros_like(self.result.normal)  # normals that it is drawn to where few lights do not support more
         self._robust = self.result.normal
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._lobe, self._supported, self._pull = Diffuse(), Diffuse(), True, 0.0
+        self._shape, self._lobe, self._supported, self._pull, self._simpler = Diffuse(), Diffuse(), True, 0.0, Method.LAMBERT
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -158,7 +158,7 @@ class _Walk:
             start = pair_starts(self._solved, LOBE_PIXELS)
             pixels = np.concatenate([start, start + APART]) if len(start) else np.tile(self._spread, 2)
             support = support_of(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
-            self._supported, self._pull = support.lobes, support.pull
+            self._supported, self._pull, self._simpler = support.lobes, support.pull, support.simpler
             self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
         samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._supported:
@@ -200,7 +200,7 @@ class _Walk:
         told = self.result.facts["bounced_light"] = {"taken_out": light.arriving is not None}
         if shown is not None:
             told["shown"] = round(shown, 3)
-        if light.arriving is None or self._field is not None or not self._supported:
+        if light.arriving is None or self._field is not None:
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
         settled = settle(light, self.result.normal, self._shape, self._pick, middles, relative=relative)
@@ -261,6 +261,8 @@ class _Walk:
         def fit(batch: Batch) -> None:
             pixels, samples = batch
             light_on[samples.device].keep(pixels, samples)
+            if self._pull:
+                self._simple[:, pixels] = simpler_normals(samples, self._simpler, self._simple[:, pixels].T).T
             for at, kind, first_pair in kinds.groups(pixels):
                 fit_kind(pixels[at], samples if len(at) == len(pixels) else choose(samples, at), kind, first_pair)
 

@@ -66,12 +66,8 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
         rest = samples._replace(grey=device_values(samples, kept))
         found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
         predicted[0][:, out] = np.maximum(predict(samples, found.normal, found.weights, shape=Diffuse())[:, out], 0)
-        for model, weights in ((1, (kept > 0).astype(np.float64)), (2, _middle(kept))):
-            b = _least_squares(kept, toward, weights)
-            for _ in range(REWEIGHTINGS if model == 2 else 0):
-                off = kept - np.einsum("nlc,nc->nl", toward, b)
-                b = _least_squares(kept, toward, weights / (1 + (off / (CAUCHY_SCALE * np.linalg.norm(b, axis=1)[:, None] + RIDGE)) ** 2))
-            predicted[model][:, out] = np.maximum(np.einsum("nlc,nc->nl", toward[:, out], b), 0)
+        for model, method in enumerate((Method.LAMBERT, Method.ROBUST), start=1):
+            predicted[model][:, out] = np.maximum(np.einsum("nlc,nc->nl", toward[:, out], _simple_fit(kept, toward, method)), 0)
     given = readings >= 0
     count = len(readings) // 2
     if not given[:count].any():
@@ -81,6 +77,27 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     first, second = left.reshape(2, count, -1)
     shared = float((first * second).sum()) / max(0.5 * float((left**2).sum()), 1e-30)
     return LeftOut(costs[0], costs[1], costs[2], shared)
+
+
+def simpler_normals(samples: Samples, simpler: Method, start: np.ndarray) -> np.ndarray:
+    """Return [n, 3] unit normals of the readings of samples by a simpler method, LAMBERT or ROBUST; those of `start` where at most three
+    readings are left, which nothing checks."""
+    readings = host_values(samples, samples.grey).astype(np.float64)
+    b = _simple_fit(readings, np.moveaxis(host_vectors(samples, samples.toward), 0, -1).astype(np.float64, order="C"), simpler)
+    length = np.linalg.norm(b, axis=1, keepdims=True)
+    told = ((readings > 0).sum(axis=1, keepdims=True) > 3) & (length > RIDGE)
+    return np.where(told, b / np.maximum(length, RIDGE), start).astype(np.float32)
+
+
+def _simple_fit(readings: np.ndarray, toward: np.ndarray, simpler: Method) -> np.ndarray:
+    """Return [n, 3] albedo times normal of readings [n, lights], of which those at 0 or below do not count, by a simpler method."""
+    robust = simpler is Method.ROBUST
+    weights = _middle(readings) if robust else (readings > 0).astype(np.float64)
+    b = _least_squares(readings, toward, weights)
+    for _ in range(REWEIGHTINGS if robust else 0):
+        off = readings - np.einsum("nlc,nc->nl", toward, b)
+        b = _least_squares(readings, toward, weights / (1 + (off / (CAUCHY_SCALE * np.linalg.norm(b, axis=1)[:, None] + RIDGE)) ** 2))
+    return b
 
 
 def _middle(readings: np.ndarray) -> np.ndarray:

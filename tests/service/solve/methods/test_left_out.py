@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.trials.declared import Case, write
 from service.requests.solve import Method, SolveRequest
-from service.solve.methods.support import SHARED, is_supported, leave_out
+from service.solve.methods.support import SHARED, is_supported, leave_out, simpler_normals
 from service.solve.solve import solve
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
 from tests.kernels.scenes import cap
@@ -51,6 +51,21 @@ def test_noise_in_shadows_is_predicted_by_middle_ranks(device):
     assert abs(left.shared) < SHARED / 2
     of_same = leave_out(sample(np.tile(radiance[..., :96], 2), device, lights=lights)[0], np.tile(normal[:96], (2, 1)))
     assert of_same.shared == pytest.approx(1)
+
+
+def test_simpler_normals_follow_the_readings_that_they_are_given(device):
+    """Of a matt surface both simpler methods have the normal, to half floats; where one reading is three times too bright, that of middle
+    ranks has it, and least squares does not."""
+    normal = tilted(96, 30.0)
+    radiance = render(normal, f0=None, lights=LIGHTS)
+    brightest = np.zeros(len(LIGHTS))
+    brightest[3] = 2.0
+    for readings, right in ((radiance, True), (radiance * (1 + brightest[:, None]), False)):
+        samples, _ = sample(readings, device, lights=LIGHTS)
+        robust, lambert = (np.median(angles_degrees(simpler_normals(samples, method, normal), normal))
+                           for method in (Method.ROBUST, Method.LAMBERT))
+        assert robust < 0.1
+        assert lambert < 0.1 if right else lambert > 10
 
 
 @pytest.mark.long
