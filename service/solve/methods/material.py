@@ -36,7 +36,7 @@ from kernels.status import ESTIMATED, Status
 from service.requests.solve import Method
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
-from service.solve.base.solution import Solution, SolveInput, half
+from service.solve.base.solution import Solution, SolveInput, half, raise_error
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
@@ -117,6 +117,7 @@ class _Walk:
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._simple = np.zeros_like(self.result.normal)  # normals that it is drawn to where few lights do not support more
         self._robust = self.result.normal
+        self._unknown_bounce: np.ndarray | float = 0.0  # degrees, [pixels], by which an unknown strength of that light turns normals
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
         self._shape, self._lobe, self._supported, self._pull, self._simpler = Diffuse(), Diffuse(), True, 0.0, Method.LAMBERT
 
@@ -204,6 +205,7 @@ class _Walk:
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
         settled = settle(light, self.result.normal, self._shape, self._pick, middles, relative=relative)
+        self._unknown_bounce = settled.degrees
         told["strength"] = round(settled.light.albedo_scale, 3)
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
@@ -290,6 +292,7 @@ class _Walk:
             (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual, own, tilt, misread,
              shown),
             (None if light is None else light.found, kinds.which, kinds.kinds, self._supported, shared)))
+        raise_error(result, self._unknown_bounce)
         result.shared_misfit, result.albedo_own, result.albedo_tilt = shared, own, tilt
         read, shape = partial(self._read, light=light), self._given.mask.shape
         abundance[replace_unseen_metals(result, shown, shape, kinds, read)] = 0
