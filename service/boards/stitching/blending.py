@@ -109,8 +109,9 @@ class TileErrors(NamedTuple):
             along, upwards = own[fill] * across, -own[fill] * down
             change[number, :3] = along.sum(), upwards.sum(), (upwards * right - along * up).sum()
             least += LEAST_SHIFT_PX**2 * float(along.sum() ** 2 + upwards.sum() ** 2)
-        flat = change.ravel() / self.grid.pixel_m
-        return float(np.sqrt(max(flat @ self.motions.covariance @ flat, 0.0) + least))
+        there = np.flatnonzero(change)
+        flat = change.ravel()[there] / self.grid.pixel_m
+        return float(np.sqrt(max(flat @ self.motions.covariance[np.ix_(there, there)] @ flat, 0.0) + least))
 
 
 class Blender:
