@@ -116,7 +116,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
         raise CalibrationError(f"{captures[0].folder}: is one pose of the board, which shows a line of each plane: give {LEAST_BOARDS} "
                                "poses or more")
     frames = _laser_frames(captures[0])
-    stripes: list[list[np.ndarray]] = [[] for _ in frames]
+    stripes: list[dict[str, np.ndarray]] = [{} for _ in frames]
     boards, every = [], []
     timings.stage("boards", len(captures))
     for number, capture in enumerate(captures, start=1):
@@ -125,7 +125,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
         every.append(corners)
         for index, points in enumerate(found):
             if len(points):
-                stripes[index].append(points)
+                stripes[index][str(capture.folder)] = points
         timings.advance(number)
     by_boards = focal_by_boards(every, request.board, request.square_m, captures[0].camera)
     ratio, sigma = (1.0, 0.0) if by_boards is None else by_boards
@@ -137,7 +137,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
     planes: list[MeasuredPlane | CalibrationError] = []
     for index, frame in enumerate(frames):
         try:
-            plane = fit_light_plane(stripes[index])
+            plane = fit_light_plane(list(stripes[index].values()), list(stripes[index]))
         except CalibrationError as error:
             if not request.drop_failed:
                 raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}; --drop-failed leaves such frames out"

@@ -7,6 +7,7 @@ calibration of a structured light stripe vision sensor through planar target of 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -22,6 +23,11 @@ LARGEST_SIGMA_DEGREES = 1.0
 ROUNDS, CAUCHY = 20, 1.5
 """Rounds of re-weighting of a plane, and the scale of its Cauchy weights in standard deviations."""
 LEAST_POINTS = 20
+APART = 5.0
+"""Stripes lie in no common plane if they miss it by so many times what each scatters about its own line; one board is to blame without
+which the others miss theirs by so many times less."""
+LEAST_OTHERS = 3
+"""The fewest boards that agree on a plane, and on that another is to blame: through two stripes that are nearly parallel a plane goes."""
 UNIT_PX = 1000.0
 """Focal length of the camera without distortion in whose image corners are compared; any will do."""
 
@@ -116,32 +122,57 @@ def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, 
     return filled.astype(bool)
 
 
-def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
-    """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each.
-    Raises CalibrationError if there are too few points, or they lie along one line."""
-    points = np.concatenate([np.zeros((0, 3)), *poses])
-    if len(poses) < 2 or len(points) < LEAST_POINTS:
-        raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {len(points)} places: two boards and {LEAST_POINTS} "
-                               "places are needed")
+def fit_light_plane(poses: list[np.ndarray], names: Sequence[str] = ()) -> LightPlane:
+    """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each. `names`: of the boards, for a message.
+    Raises CalibrationError if there are too few points, or they lie along one line or in no plane."""
+    count = sum(map(len, poses))
+    if len(poses) < 2 or count < LEAST_POINTS:
+        raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {count} places: two boards and {LEAST_POINTS} places are "
+                               "needed")
+    middle, normal, residual, breadth = _plane(poses)
+    near = CAUCHY * MAD_TO_SIGMA * float(np.median(np.abs((np.concatenate(poses) - middle) @ normal))) + 1e-9
+    agree = sum(float(np.median(np.abs((own - middle) @ normal))) < near for own in poses)
+    if agree < min(LEAST_OTHERS, len(poses)):  # two agree on some plane whichever they are: what all miss theirs by counts
+        residual = _plane(poses, rounds=1)[2]
+    straight = float(np.median([_scatter(own) for own in poses]))
+    # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
+    noise = max(residual, straight)
+    # a board whose pose is off moves all its points: the boards are the independent measurements
+    sigma = math.degrees(math.atan2(max(noise, 1e-9), max(breadth, 1e-12))) / math.sqrt(max(len(poses) - 1, 1))
+    if sigma > LARGEST_SIGMA_DEGREES:
+        if residual > APART * straight:
+            raise CalibrationError(f"its stripes miss any common plane by {1000 * residual:.2g} mm, and each is straight to "
+                                   f"{1000 * straight:.2g} mm{_to_blame(poses, names)}: check the order of the frames of each "
+                                   "pose, and that board and laser stood still while they were taken")
+        raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
+                               "board towards the camera and away from it")
+    return LightPlane(middle, normal, residual, max(noise, 1e-9) / math.sqrt(len(poses)), sigma, count)
+
+
+def _plane(poses: Sequence[np.ndarray], rounds: int = ROUNDS) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Return a point, the normal, the root mean square distance of the points, and that along their second direction, by robust weights;
+    by none in a single round."""
+    points = np.concatenate(poses)
     # every board counts alike, however much of the stripe it shows
     share = np.concatenate([np.full(len(own), 1 / len(own)) for own in poses])
     weight = share.copy()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         middle = weight @ points / weight.sum()
         values, vectors = np.linalg.eigh((points - middle).T @ ((points - middle) * weight[:, None]) / weight.sum())
         normal = vectors[:, 0]
         off = (points - middle) @ normal
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off))) + 1e-9
         weight = share / (1 + (off / (CAUCHY * spread)) ** 2)
-    residual = math.sqrt(max(float(values[0]), 0.0))
-    # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
-    noise = max(residual, float(np.median([_scatter(own) for own in poses])))
-    # a board whose pose is off moves all its points: the boards are the independent measurements
-    sigma = math.degrees(math.atan2(max(noise, 1e-9), math.sqrt(max(float(values[1]), 1e-24)))) / math.sqrt(max(len(poses) - 1, 1))
-    if sigma > LARGEST_SIGMA_DEGREES:
-        raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
-                               "board towards the camera and away from it")
-    return LightPlane(middle, normal, residual, max(noise, 1e-9) / math.sqrt(len(poses)), sigma, len(points))
+    return middle, normal, math.sqrt(max(float(values[0]), 0.0)), math.sqrt(max(float(values[1]), 0.0))
+
+
+def _to_blame(poses: Sequence[np.ndarray], names: Sequence[str]) -> str:
+    """Return words that name the board without which the stripes of the others lie in one plane; nothing where there is none."""
+    if len(poses) <= LEAST_OTHERS or len(names) != len(poses):
+        return ""
+    left = [_plane([*poses[:one], *poses[one + 1 :]], rounds=1)[2] for one in range(len(poses))]
+    first, second = np.argsort(left)[:2]
+    return f"; without that of {names[first]} the others lie in one plane" if APART * left[first] < left[second] else ""
 
 
 def _scatter(points: np.ndarray) -> float:
