@@ -51,6 +51,22 @@ class BoardPlane(NamedTuple):
         return np.asarray(rays * (self.point @ self.normal / (rays @ self.normal))[:, None])
 
 
+class BoardLens(NamedTuple):
+    """The lens by which boards fit best."""
+
+    focal: float
+    """Focal length over that of the camera."""
+    focal_sigma: float
+    bent_focal: float
+    """The same where k1 is free too."""
+    bent_focal_sigma: float
+    k1: float
+    """Radial distortion beside that of the camera."""
+    k1_sigma: float
+    k1_px: float
+    """What k1 moves the outermost corner by, pixels."""
+
+
 class LightPlane(NamedTuple):
     """A plane of light through the stripes on boards."""
 
@@ -87,9 +103,9 @@ def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, ca
     return BoardPlane(point, normal if normal @ point < 0 else -normal, float(np.sqrt((off**2).sum(axis=1).mean())))
 
 
-def focal_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> tuple[float, float] | None:
-    """Return the focal length of a camera by which boards fit best, over its own, and the standard deviation of that ratio; the rest of the
-    lens stays. None from fewer than three boards, or where they do not tell. `corners`, `board`: as of `board_plane`, of each board."""
+def lens_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> BoardLens | None:
+    """Return the lens of a camera by which boards fit best; what is not measured stays. None from fewer than three boards, or where they do
+    not tell. `corners`, `board`: as of `board_plane`, of each board."""
     if len(corners) < LEAST_BOARDS:
         return None
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
@@ -100,16 +116,22 @@ def focal_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m:
         x, y = camera.plane_at(*own[known].T)
         points.append(every[known])
         seen.append((UNIT_PX * np.stack([x, -y], axis=1)).astype(np.float32))
-    matrix = np.diag([UNIT_PX, UNIT_PX, 1.0])
-    fixed = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    fixed = (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
+             | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
+    told: list[float] = []
     try:
-        _, found, _, _, _, spread, _, _ = cv2.calibrateCameraExtended(
-            points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), matrix, np.zeros(5),
-            flags=fixed | cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
+        for flags in (fixed | cv2.CALIB_FIX_K1, fixed):
+            _, matrix, bent, _, _, spread, _, _ = cv2.calibrateCameraExtended(
+                points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), np.diag([UNIT_PX, UNIT_PX, 1.0]), np.zeros(5), flags=flags)
+            told += [float(matrix[0, 0]) / UNIT_PX, float(spread[:2].max()) / UNIT_PX, float(bent.ravel()[0]), float(spread.ravel()[4])]
     except cv2.error:
         return None
-    ratio, sigma = float(found[0, 0]) / UNIT_PX, float(spread.max()) / UNIT_PX
-    return (ratio, sigma) if np.isfinite([ratio, sigma]).all() and ratio > 0 else None
+    focal, focal_sigma, _, _, bent_focal, bent_focal_sigma, k1, k1_sigma = told
+    if not np.isfinite(told).all() or min(focal, bent_focal) <= 0:
+        return None
+    farthest = max(float(np.hypot(*own.T).max()) for own in seen) / UNIT_PX
+    assert camera.focal_px is not None
+    return BoardLens(focal, focal_sigma, bent_focal, bent_focal_sigma, k1, k1_sigma, abs(k1) * farthest**3 * max(camera.focal_px))
 
 
 def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:

@@ -96,6 +96,24 @@ def test_a_camera_that_was_refocused_is_said_and_held(relit, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("given", [None, [0.0, 0.0, 0.0]], ids=["missing", "zero"])
+def test_a_distortion_that_the_camera_lacks_is_said_and_held(relit, tmp_path, given):
+    """A lens with k1 = -0.15, which moves corners by 0.7 pixels: planes were 0.55 mm off, where 0.08 mm was stated, without a word."""
+    folders = boards(tmp_path)
+    entry = {name: value for name, value in entry_of(CAMERA).items() if name != "distortion"}
+    lens = {} if given is None else {"distortion": {"model": "brown_conrady", "k": given}}
+    for folder in folders:
+        edit_manifest(folder, camera={"projection": "perspective", **entry, **lens})
+    outcome = calibrated(relit, folders)
+    assert outcome.code == 0 and "camera.distortion: " in outcome.out and ("is missing" in outcome.out) == (given is None)
+    assert "camera.focal_px" not in outcome.out
+    found = [frame.laser for frame in Capture.open(folders[0]).manifest.frames if frame.laser is not None]
+    for laser, (point, normal) in zip(found, PLANES, strict=True):
+        off = abs((np.array(laser.point_m) - point) @ unit(normal))
+        assert off < 1.5 * laser.accuracy_m < 3e-3
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 8])
 def test_stripes_that_leave_the_board_do_not_turn_their_plane(relit, tmp_path, seed):
     """Six boards, beside some of which half of a stripe falls: taken for whole, it turned a plane by 1.4°, or had all refused."""
