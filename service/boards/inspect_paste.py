@@ -17,10 +17,11 @@ from service.boards.inspect_board import stitch_board, stitching_entries
 from service.boards.inspection_picture import PICTURE_FILE, Frame, write_picture
 from service.boards.paste import Measured, PadPaste, Paste, measure_paste, openings_of
 from service.boards.shared_print import shared_sentences
+from service.boards.stitching.blending import TileErrors
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
-from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend
+from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend, blend_with_errors
 from service.boards.tiles import BoardTiles, read_tiles
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -95,9 +96,11 @@ def inspect_paste(request: InspectPasteRequest, progress: Progress | None = None
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
     stitched = stitch_board(board, request.pixel_m, request.placement_m, timings)
     search_m = SEARCH_SIGMA * (request.placement_m or SHIFT_SIGMA_PX * stitched.grid.pixel_m)
-    heights, warnings = _placed(board, stitched, pads, request, search_m, timings)
+    heights, errors = _placed(board, stitched, pads, request, search_m, timings)
+    warnings = list(stitched.warnings)
     timings.stage("measure", 1)
-    paste = measure_paste(heights, pads, stencil_m=request.stencil_m, area_level=request.area_level, bridge_level=request.bridge_level)
+    paste = measure_paste(heights, pads, errors, stencil_m=request.stencil_m, area_level=request.area_level,
+                          bridge_level=request.bridge_level)
     found = _datum(paste, pads, marks, request, search_m)
     results = _judge(paste, pads, names, found.datum, limits, _tile_variance(board, stitched, pads), request)
     verdict = Verdict.worst(result.verdict for result in results if result.verdict is not None) if limits else None
@@ -162,8 +165,8 @@ def _on(grid: BoardGrid, places_m: np.ndarray) -> np.ndarray:
 
 
 def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: InspectPasteRequest, search_m: float, timings: Timings
-            ) -> tuple[HeightMap, list[str]]:
-    """Return the heights of the board where its paste lies on the openings."""
+            ) -> tuple[HeightMap, TileErrors]:
+    """Return the heights of the board where its paste lies on the openings, and the errors of its tiles."""
     grid = stitched.grid
     timings.stage("match", 2 * len(board.tiles))
     first = blend(board.tiles, stitched, grid, progress=timings.advance)
@@ -179,9 +182,8 @@ def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: Ins
         moved = lay(first, openings_of(grid, pads) > 0, stencil_m=request.stencil_m, search_px=search, apart_px=float(apart))
     except BoardError as error:
         raise BoardError(f"{request.paste}: {error}") from error
-    heights = blend(board.tiles, stitched, grid, motion=np.array([*moved, 0.0, 0.0, 0.0, 0.0]),
-                    progress=lambda done: timings.advance(len(board.tiles) + done))
-    return heights, list(stitched.warnings)
+    return blend_with_errors(board.tiles, stitched, grid, motion=np.array([*moved, 0.0, 0.0, 0.0, 0.0]),
+                             progress=lambda done: timings.advance(len(board.tiles) + done))
 
 
 def _datum(paste: Paste, pads: list[Pad], marks: np.ndarray, request: InspectPasteRequest, search_m: float) -> _Marks:

@@ -7,6 +7,7 @@ over its opening, what is as high as a bridge, and the flanks around both, so th
 and offset are those of the outline at a level. Copper under the mask that comes as near as a flank counts as paste.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label, median_filter, zoom
 from scipy.special import ndtr
 
+from service.boards.stitching.blending import TileErrors
 from service.boards.stitching.grid import BoardGrid, HeightMap, robust_sigma
 from stage.formats.gerber import Pad
 from stage.spread import tukey_weights
@@ -85,8 +87,10 @@ class _Cells(NamedTuple):
     own: np.ndarray  # [rows, cols] the pad to which paste at a pixel belongs; 0: none
 
 
-def measure_paste(heights: HeightMap, pads: Sequence[Pad], *, stencil_m: float, area_level: float, bridge_level: float) -> Paste:
+def measure_paste(heights: HeightMap, pads: Sequence[Pad], errors: TileErrors | None = None, *, stencil_m: float, area_level: float,
+                  bridge_level: float) -> Paste:
     """Measure the paste on all pads.
+    `errors`: those of the tiles of the heights; None: there are no tiles, and shared errors are those of the heights.
     `area_level`, `bridge_level`: heights, as parts of the stencil's, above which pixels belong to the area, and above which paste connects
     pads."""
     cells = _cells(heights, pads)
@@ -99,8 +103,8 @@ def measure_paste(heights: HeightMap, pads: Sequence[Pad], *, stencil_m: float, 
     level = heights._replace(height=heights.height - _floor_map(floors, boxes, cells.nearest, pads, heights.grid.pixel_m))
     levels = area_level * stencil_m, bridge_level * stencil_m
     found = [None if box is None or floors[number] is NOWHERE else
-             _measure(level.cut(box), cells.own[box] == number, pads[number - 1], np.stack(level.grid.coordinates(*np.mgrid[box])),
-                      floors[number].sigma, stencil_m, levels) for number, box in enumerate(boxes, start=1)]
+             _measure(level, box, cells.own[box] == number, pads[number - 1], errors, floors[number].sigma, stencil_m, levels)
+             for number, box in enumerate(boxes, start=1)]
     return Paste(level, found, _bridges(level, cells.openings, levels[1]), levels[1])
 
 
@@ -179,22 +183,27 @@ def _groups(numbers: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, list[n
     return unlike, np.split(values, first[1:])
 
 
-def _measure(part: HeightMap, own: np.ndarray, pad: Pad, place: np.ndarray, floor_sigma: float, stencil_m: float,
-             levels_m: tuple[float, float]) -> PadPaste | None:
+def _measure(whole: HeightMap, box: tuple[slice, slice], own: np.ndarray, pad: Pad, errors: TileErrors | None, floor_sigma: float,
+             stencil_m: float, levels_m: tuple[float, float]) -> PadPaste | None:
     """Measure the paste of a pad in its box; missing pixels are as high as the nearest measured one, to within the stencil.
     `levels_m`: those of the area and of bridges."""
+    part, place = whole.cut(box), np.stack(whole.grid.coordinates(*np.mgrid[box]))
     known, square = part.measured & own, part.grid.pixel_m**2
     if not known.any():
         return None
     row, col = distance_transform_edt(~known, return_distances=False, return_indices=True)
     height = part.height[row, col]
     variance = np.where(known, part.variance, stencil_m**2 / 12)
-    shared = np.hypot(part.systematic[row, col], floor_sigma)
+    shared = np.hypot((part.systematic if errors is None else errors.steady[box])[row, col], floor_sigma)
+
+    def by_shifts(values: np.ndarray, within: np.ndarray) -> float:
+        return 0.0 if errors is None else errors.shift_sigma(box, (row, col), values, within)
+
     opening, smooth = pad.holds(*place), median_filter(height, 3)
     flank = FLANK * pad.size_m.min() / part.grid.pixel_m
     held = own & (distance_transform_edt(~(opening | (own & (smooth > levels_m[1])))) <= flank)
     volume, full = float(height[held].sum()) * square, pad.area_m2 * stencil_m
-    volume_sigma = float(np.hypot(np.sqrt(variance[held].sum()), shared[held].sum())) * square
+    volume_sigma = math.hypot(math.sqrt(variance[held].sum()), shared[held].sum(), by_shifts(height, held)) * square
 
     edge, size = levels_m[0], pad.area_m2 / square
     fine = zoom(np.where(own, smooth, 0.0), FINE, order=1, mode="nearest", grid_mode=True) > edge
@@ -204,13 +213,17 @@ def _measure(part: HeightMap, own: np.ndarray, pad: Pad, place: np.ndarray, floo
     step = max(float(np.median(shared[own])), 0.02 * stencil_m)
     slope = abs(int((own & (smooth > edge - step)).sum()) - int((own & (smooth > edge + step)).sum())) / (2 * step)
     sides = EDGE_PX * pad.size_m / part.grid.pixel_m
-    area_sigma = np.sqrt(doubt.sum() + (slope * np.median(shared[own])) ** 2 + 2 * sides @ sides)
+    outline = math.sqrt(doubt.sum() + (slope * np.median(shared[own])) ** 2 + 2 * sides @ sides)
+    area_sigma = math.hypot(outline, by_shifts((smooth > edge).astype(np.float64), own))
     top = own & (smooth > edge) if count else own & opening
     tall = max(int(top.sum()), 1)
-    height_sigma = float(np.hypot(np.sqrt(variance[top].sum()) / tall, shared[top].mean() if top.any() else stencil_m))
+    mean = float(zoom(height, FINE, order=1, mode="nearest", grid_mode=True)[fine].mean() if count else height[top].sum() / tall)
+    height_sigma = math.hypot(math.sqrt(variance[top].sum()) / tall, shared[top].mean() if top.any() else stencil_m,
+                              outline / tall * max(mean - edge, 0.0) if count else 0.0,
+                              by_shifts(np.where(top, height - mean, 0), own) / tall)
     values = {"volume_percent": Measured(volume / full, volume_sigma / full),
               "area_percent": Measured(float(count / size), float(area_sigma / size)),
-              "height_percent": Measured(float(height[top].sum()) / tall / stencil_m, height_sigma / stencil_m)}
+              "height_percent": Measured(mean / stencil_m, height_sigma / stencil_m)}
     offset, spread = np.full(2, np.nan), np.full(2, np.nan)
     if count:
         rows, cols = np.nonzero(fine)

@@ -1,6 +1,7 @@
 """Calibration of the planes of a laser from poses of a target on which its stripes are seen: a chessboard, or a step of known height,
 which is a right-angled block on a flat base."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,7 +14,7 @@ from kernels.status import Status
 from kernels.structured.stripe import KNOWN_REACH, find_stripe
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.calibrate.solvers.charuco import Charuco, charuco_of, find_board
-from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, focal_by_boards, inside_board
+from service.calibrate.solvers.laser_plane import BoardLens, LightPlane, board_plane, fit_light_plane, inside_board, lens_by_boards
 from service.calibrate.solvers.laser_step import fit_step
 from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
 from service.depth.base.triangulation_check import check_perspective
@@ -21,6 +22,7 @@ from service.depth.laser.laser import ambient_light
 from service.depth.laser.stripes import Signal, stripe_signal
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
+from stage.capture.camera import Camera, Distortion
 from stage.capture.capture import Capture
 from stage.capture.light import LaserPlane
 from stage.capture.manifest import FILE_NAME, Frame
@@ -41,10 +43,9 @@ LARGEST_RESIDUAL_PX = 1.0
 
 Along = Literal["row", "column"]
 ALONG: tuple[Along, ...] = ("row", "column")
-
-
-FOCAL_SIGMAS, LEAST_FOCAL = 4.0, 0.005
-"""By how many standard errors, and by what part, the focal length by the boards differs from that of the camera to be said."""
+LENS_SIGMAS, LEAST_FOCAL, LEAST_BENT_PX = 4.0, 0.005, 0.3
+"""By how many standard errors the lens by the boards differs from that of the camera to be said, by what part its focal length, and by how
+many pixels at the outermost corner its distortion: corners are found to .1."""
 
 
 class LaserPlanes(NamedTuple):
@@ -78,6 +79,14 @@ class _OnTarget(NamedTuple):
     planes: Sequence[MeasuredPlane | CalibrationError]
     seen: dict[str, Any]
     said: tuple[str, ...] = ()
+
+
+class _View(NamedTuple):
+    """What a capture shows of a board."""
+
+    corners: np.ndarray  # [corners, 2] image coordinates, NaN where one is not seen
+    stripes: list[tuple[np.ndarray, np.ndarray]]
+    """Image coordinates u and v of the points of each stripe, [n] each, none where it is not seen."""
 
 
 def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, *,
@@ -115,57 +124,75 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
     if len(captures) < LEAST_BOARDS:
         raise CalibrationError(f"{captures[0].folder}: is one pose of the board, which shows a line of each plane: give {LEAST_BOARDS} "
                                "poses or more")
-    frames = _laser_frames(captures[0])
-    stripes: list[list[np.ndarray]] = [[] for _ in frames]
-    boards, every = [], []
+    camera, frames = captures[0].camera, _laser_frames(captures[0])
+    boards: list[dict[str, Any]] = []
+    views: dict[str, _View] = {}
     timings.stage("boards", len(captures))
     for number, capture in enumerate(captures, start=1):
-        plane_rms, found, corners = _stripes_on_board(capture, request.board, request.square_m, charuco_of(request), device)
-        boards.append({"capture": str(capture.folder), "rms_px": round(plane_rms, 4), "stripes": sum(len(one) > 0 for one in found)})
-        every.append(corners)
-        for index, points in enumerate(found):
-            if len(points):
-                stripes[index].append(points)
+        views[str(capture.folder)] = view = _stripes_on_board(capture, request.board, charuco_of(request), device)
+        rms = board_plane(view.corners, request.board, request.square_m, camera).rms_px
+        boards.append({"capture": str(capture.folder), "rms_px": round(rms, 4), "stripes": sum(u.size > 0 for u, _ in view.stripes)})
         timings.advance(number)
-    by_boards = focal_by_boards(every, request.board, request.square_m, captures[0].camera)
-    ratio, sigma = (1.0, 0.0) if by_boards is None else by_boards
-    off = ratio - 1 if abs(ratio - 1) > max(FOCAL_SIGMAS * sigma, LEAST_FOCAL) else 0.0
-    said = () if off == 0 else (
-        f"{captures[0].folder / FILE_NAME}: camera.focal_px: the corners of the boards fit best with {ratio:.3f} times that "
-        f"(σ {sigma:.1g}), as where the camera was refocused since: measure it again with relit calibrate procam or stereo; the standard "
-        "errors of the planes hold the difference",)
+    lens = lens_by_boards([view.corners for view in views.values()], request.board, request.square_m, camera)
+    said, other = _other_lens(lens, camera, f"{captures[0].folder / FILE_NAME}: camera.")
     planes: list[MeasuredPlane | CalibrationError] = []
     for index, frame in enumerate(frames):
         try:
-            plane = fit_light_plane(stripes[index])
+            plane = _plane_on_boards(views, index, camera, request)
+            beside = plane if other is None else _plane_on_boards(views, index, other, request)
         except CalibrationError as error:
             if not request.drop_failed:
                 raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}; --drop-failed leaves such frames out"
                                        ) from error
             planes.append(error)
             continue
-        # depths that are all off by a part move a plane along its normal, and turn it
-        along = abs(float(plane.normal[2]))
-        held = plane._replace(sigma_m=float(np.hypot(plane.sigma_m, off * along * plane.point[2])),
-                              sigma_degrees=float(np.hypot(plane.sigma_degrees, np.degrees(off * along * np.sqrt(max(1 - along**2, 0))))))
+        away = float((plane.point - beside.point) @ beside.normal)
+        turned = math.degrees(math.asin(min(float(np.linalg.norm(np.cross(plane.normal, beside.normal))), 1.0)))
+        sigma_m, sigma_degrees = math.hypot(plane.sigma_m, away), math.hypot(plane.sigma_degrees, turned)
         planes.append(MeasuredPlane(
-            plane.point, plane.normal, held.sigma_m, held.sigma_degrees,
-            {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{held.sigma_degrees:.3g}"), "points": plane.points},
+            plane.point, plane.normal, sigma_m, sigma_degrees,
+            {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{sigma_degrees:.3g}"), "points": plane.points},
             (f"{1000 * plane.residual_m:.3f} mm", f"{plane.points} points")))
     failed = [plane for plane in planes if isinstance(plane, CalibrationError)]
     if len(failed) == len(planes):
         raise CalibrationError(f"{captures[0].folder}: frames: no plane is told by the boards: {failed[0]}")
-    return _OnTarget(planes, {"boards": boards, "focal_by_boards": None if by_boards is None else digits(by_boards)}, said)
+    return _OnTarget(planes, {"boards": boards, "focal_by_boards": None if lens is None else digits((lens.focal, lens.focal_sigma)),
+                              "k1_by_boards": None if lens is None else digits((lens.k1, lens.k1_sigma))}, said)
+
+
+def _other_lens(lens: BoardLens | None, camera: Camera, where: str) -> tuple[tuple[str, ...], Camera | None]:
+    """Return what is said of a camera that the boards contradict, and the camera by them; None: they do not."""
+    if lens is None:
+        return (), None
+    own = Distortion(model="brown_conrady") if camera.distortion is None else camera.distortion
+    bent = lens.k1 if abs(lens.k1) > LENS_SIGMAS * lens.k1_sigma and lens.k1_px > LEAST_BENT_PX else 0.0
+    ratio, sigma = (lens.bent_focal, lens.bent_focal_sigma) if bent else (lens.focal, lens.focal_sigma)
+    ratio = ratio if abs(ratio - 1) > max(LENS_SIGMAS * sigma, LEAST_FOCAL) else 1.0
+    missing, best = "is missing, and " if camera.distortion is None else "", "the corners of the boards fit best with"
+    said = [] if ratio == 1 else [f"focal_px: {best} {ratio:.3f} times that (σ {sigma:.1g}), as where the camera was refocused since"]
+    said += [f"distortion: {missing}{best} k1 = {own.k[0] + bent:.3g} (σ {lens.k1_sigma:.1g}), which moves the outermost by "
+             f"{lens.k1_px:.2g} pixels"] if bent else []
+    assert camera.focal_px is not None
+    focal = (ratio * camera.focal_px[0], ratio * camera.focal_px[1])
+    other = camera.model_copy(update={"focal_px": focal, "distortion": own.model_copy(update={"k": (own.k[0] + bent, *own.k[1:])})})
+    return tuple(f"{where}{words}: measure the camera again with relit calibrate procam or stereo; the standard errors of the planes hold "
+                 "the difference" for words in said), other if said else None
+
+
+def _plane_on_boards(views: dict[str, _View], index: int, camera: Camera, request: LaserPlanesRequest) -> LightPlane:
+    """Return the plane of a laser frame by its stripes on all boards that show it, as this camera sees them."""
+    assert request.board is not None and request.square_m is not None
+    points = {name: board_plane(view.corners, request.board, request.square_m, camera).meet(camera, *view.stripes[index])
+              for name, view in views.items() if view.stripes[index][0].size}
+    return fit_light_plane(list(points.values()), list(points))
 
 
 def _laser_frames(capture: Capture) -> list[Frame]:
     return [frame for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane)]
 
 
-def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, charuco: Charuco | None,
-                      device: str) -> tuple[float, list[np.ndarray], np.ndarray]:
-    """Return how well the pose of the board fits, pixels, the points of each stripe on it, [n, 3] metres, none where it is not seen, and
-    its corners, [corners, 2]."""
+def _stripes_on_board(capture: Capture, board: tuple[int, int], charuco: Charuco | None, device: str) -> _View:
+    """Return where a board and the stripes on it are seen."""
     correction = Correction.of(capture)
     grey, black = _even_light(capture, correction), _uniform(capture, correction, "black")
     if grey is None:
@@ -174,15 +201,13 @@ def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float,
     corners = find_board(grey, board, charuco)
     if isinstance(corners, str):
         raise CalibrationError(f"{capture.folder}: {corners}")
-    plane = board_plane(corners, board, square_m, capture.camera)
     inside = inside_board(corners, board, grey.shape)
     dark = np.float32(0) if black is None else black
     # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
     albedo = np.where(inside, np.maximum(grey, 0), 0).astype(np.float32)
     stripes = [_stripes(stripe_signal(correction.apply(frame).pixels - dark, inside), albedo, device) for frame in _laser_frames(capture)]
     longer = [max(pair, key=lambda seen: len(seen.lines)) for pair in _whole(stripes, inside)]
-    return plane.rms_px, [plane.meet(capture.camera, *seen.image()) if len(seen.lines) >= LEAST_LINES else np.zeros((0, 3))
-                          for seen in longer], corners
+    return _View(corners, [seen.image() if len(seen.lines) >= LEAST_LINES else (np.zeros(0), np.zeros(0)) for seen in longer])
 
 
 def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Timings) -> _OnTarget:

@@ -1,8 +1,12 @@
 """Points of tiles onto the grid of a board, and the blend of the patches of all tiles into one height map, by inverse variance."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch, gradients, shift_error
+from service.boards.stitching.motions import Motions
+from service.boards.stitching.overlap import UNKNOWNS
 
 LEAST_WEIGHT = 0.5
 """The least sum of weights of the points around a measured pixel; where every pixel has a point, the sum is 1."""
@@ -75,6 +79,41 @@ def _filled(height: np.ndarray) -> np.ndarray:
     return out
 
 
+class TileErrors(NamedTuple):
+    """The errors that the pixels of a blend share, those of the tiles' shifts apart: shifts add up with the signs of the slopes, so that
+    what stands whole on one tile moves, and neither grows nor shrinks."""
+
+    grid: BoardGrid
+    steady: np.ndarray  # [rows, cols] metres: as `systematic` of the height map, without the shifts
+    shares: list[tuple[slice, slice, np.ndarray]]
+    """Rows, columns and weight of each tile, [rows, cols] float32 of the patch, over the sum of all."""
+    motions: Motions
+    centre: tuple[float, float]
+    length_m: float
+
+    def shift_sigma(self, box: tuple[slice, slice], fill: tuple[np.ndarray, np.ndarray], values: np.ndarray, within: np.ndarray) -> float:
+        """Return σ, by the shifts of all tiles, of the sum of values in a box of the grid.
+        `fill`: rows and columns in the box, [rows, cols] each, of the measured pixel that stands for a pixel. `values`: [rows, cols].
+        `within`: [rows, cols] bool, the pixels that are summed up."""
+        down, across = (np.where(within, slope, 0) for slope in np.gradient(values))
+        x, y = self.grid.coordinates(*np.mgrid[box])
+        right, up = (x - self.centre[0]) / self.length_m, (y - self.centre[1]) / self.length_m
+        change, least = np.zeros((len(self.shares), UNKNOWNS)), 0.0
+        for number, (rows, cols, share) in enumerate(self.shares):
+            if max(rows.start - box[0].stop, box[0].start - rows.stop, cols.start - box[1].stop, box[1].start - cols.stop) >= 0:
+                continue
+            own = np.zeros(values.shape)
+            top, left = max(rows.start, box[0].start), max(cols.start, box[1].start)
+            part = share[top - rows.start : box[0].stop - rows.start, left - cols.start : box[1].stop - cols.start]
+            own[top - box[0].start :, left - box[1].start :][: part.shape[0], : part.shape[1]] = part
+            along, upwards = own[fill] * across, -own[fill] * down
+            change[number, :3] = along.sum(), upwards.sum(), (upwards * right - along * up).sum()
+            least += LEAST_SHIFT_PX**2 * float(along.sum() ** 2 + upwards.sum() ** 2)
+        there = np.flatnonzero(change)
+        flat = change.ravel()[there] / self.grid.pixel_m
+        return float(np.sqrt(max(flat @ self.motions.covariance[np.ix_(there, there)] @ flat, 0.0) + least))
+
+
 class Blender:
     """Sums of patches over a grid."""
 
@@ -84,8 +123,9 @@ class Blender:
         is misplaced has wrong, metres, NaN where not known; None: those of each tile."""
         self.grid, self.centre, self.length_m, self.relief = grid, centre, length_m, relief
         shape = (grid.rows, grid.cols)
-        self.weight, self.height, self.square, self.spread, self.systematic = (np.zeros(shape) for _ in range(5))
+        self.weight, self.height, self.square, self.spread, self.systematic, self.steady = (np.zeros(shape) for _ in range(6))
         self.tiles = np.zeros(shape, dtype=np.uint8)
+        self.parts: list[tuple[slice, slice, np.ndarray]] = []
 
     def add(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float, *, noise_factor: float) -> None:
         """Add the patch of one tile.
@@ -95,9 +135,10 @@ class Blender:
         cols = slice(patch.col, patch.col + patch.height.shape[1])
         there = patch.measured
         if not there.any():
+            self.parts.append((slice(0, 0), slice(0, 0), np.zeros((0, 0), np.float32)))
             return
         variance = np.where(there, patch.variance * noise_factor**2, 1.0)
-        systematic = self._systematic(patch, covariance, shared_m)
+        systematic, steady = self._systematic(patch, covariance, shared_m)
         weight = np.where(there, 1 / (variance + systematic**2), 0)
         height = np.where(there, patch.height, 0)
         self.weight[rows, cols] += weight
@@ -105,10 +146,24 @@ class Blender:
         self.square[rows, cols] += weight * height**2
         self.spread[rows, cols] += weight**2 * variance
         self.systematic[rows, cols] += weight * systematic
+        self.steady[rows, cols] += weight * steady
+        self.parts.append((rows, cols, weight.astype(np.float32)))
         self.tiles[rows, cols] += there
 
     def result(self) -> HeightMap:
         """Return the height map."""
+        height, variance, systematic, apart = self._means()
+        return HeightMap(self.grid, height, variance, np.sqrt(systematic**2 + apart))
+
+    def errors(self, motions: Motions) -> TileErrors:
+        """Return the errors of the tiles, all of which have been added in the order of their motions."""
+        total = np.maximum(self.weight, np.finfo(np.float32).tiny)
+        shares = [(rows, cols, weight / total[rows, cols].astype(np.float32)) for rows, cols, weight in self.parts]
+        steady = np.sqrt((self.steady / total) ** 2 + self._means()[3])
+        return TileErrors(self.grid, steady, shares, motions, self.centre, self.length_m)
+
+    def _means(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return height, variance and σ of shared errors, NaN where not measured, and the variance by which tiles disagree."""
         with np.errstate(divide="ignore", invalid="ignore"):
             there = self.weight > 0
             height = np.where(there, self.height / self.weight, np.nan)
@@ -116,10 +171,11 @@ class Blender:
             systematic = np.where(there, self.systematic / self.weight, np.nan)
             scatter = np.maximum(self.square - self.height**2 / self.weight, 0)  # chi squared of the tiles at each pixel
             apart = np.where((self.tiles > 1) & (scatter > DISAGREE * (self.tiles - 1.0)), scatter / self.weight, 0)
-        return HeightMap(self.grid, height, variance, np.sqrt(systematic**2 + apart))
+        return height, variance, systematic, apart
 
-    def _systematic(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> np.ndarray:
-        """Return σ in metres of the errors that neighbouring pixels of a tile share: its offset and tilt, its shift on slopes."""
+    def _systematic(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return σ in metres of the errors that neighbouring pixels of a tile share: its offset and tilt, its shift on slopes; and without
+        the latter."""
         row, col = np.mgrid[patch.row : patch.row + patch.height.shape[0], patch.col : patch.col + patch.height.shape[1]]
         x, y = self.grid.coordinates(row, col)
         basis = np.stack([np.ones_like(x), (x - self.centre[0]) / self.length_m, (y - self.centre[1]) / self.length_m], axis=-1)
@@ -129,4 +185,5 @@ class Blender:
         right, up = (float(value) for value in np.sqrt(shift))
         relief = patch.height if self.relief is None else self.relief[row, col]
         slopes = shift_error(np.where(np.isfinite(relief), relief, patch.height), (right, up), float(np.sqrt(np.nanmedian(patch.variance))))
-        return np.asarray(np.sqrt(np.maximum(plane, 0) + shared_m**2 + slopes**2))
+        steady = np.maximum(plane, 0) + shared_m**2
+        return np.sqrt(steady + slopes**2), np.sqrt(steady)

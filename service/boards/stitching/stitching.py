@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from service.boards.stitching.blending import Blender, grid_points
+from service.boards.stitching.blending import Blender, TileErrors, grid_points
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch
 from service.boards.stitching.motions import Motions, displace, solve_motions
 from service.boards.stitching.overlap import UNKNOWNS, Evidence, Overlap, choose_candidate, measure_overlap
@@ -132,13 +132,25 @@ def stitch(
 def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
           relief: np.ndarray | None = None, progress: Callable[[int], None] = lambda done: None) -> HeightMap:
     """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none. `relief`: as in Blender."""
+    return _blended(tiles, stitched, grid, motion, relief, progress).result()
+
+
+def blend_with_errors(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray,
+                      progress: Callable[[int], None] = lambda done: None) -> tuple[HeightMap, TileErrors]:
+    """Return what `blend` does, and the errors of the tiles."""
+    blender = _blended(tiles, stitched, grid, motion, None, progress)
+    return blender.result(), blender.errors(stitched.motions)
+
+
+def _blended(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, motion: np.ndarray | None, relief: np.ndarray | None,
+             progress: Callable[[int], None]) -> Blender:
     blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m, relief=relief)
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
         patch = _patch(tile, stitched.motions.values[number] + whole, grid, stitched.centre, stitched.length_m)
         blender.add(patch, stitched.motions.of_tile(number), stitched.shared_m, noise_factor=float(stitched.tile_noise[number]))
         progress(number + 1)
-    return blender.result()
+    return blender
 
 
 def _patch(tile: TilePoints, motion: np.ndarray, grid: BoardGrid, centre: tuple[float, float], length_m: float, *,

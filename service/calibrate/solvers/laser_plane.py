@@ -7,6 +7,7 @@ calibration of a structured light stripe vision sensor through planar target of 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -22,6 +23,11 @@ LARGEST_SIGMA_DEGREES = 1.0
 ROUNDS, CAUCHY = 20, 1.5
 """Rounds of re-weighting of a plane, and the scale of its Cauchy weights in standard deviations."""
 LEAST_POINTS = 20
+APART = 5.0
+"""Stripes lie in no common plane if they miss it by so many times what each scatters about its own line; one board is to blame without
+which the others miss theirs by so many times less."""
+LEAST_OTHERS = 3
+"""The fewest boards that agree on a plane, and on that another is to blame: through two stripes that are nearly parallel a plane goes."""
 UNIT_PX = 1000.0
 """Focal length of the camera without distortion in whose image corners are compared; any will do."""
 
@@ -43,6 +49,22 @@ class BoardPlane(NamedTuple):
         x, y = camera.plane_at(u, v)
         rays = np.stack([x, y, -np.ones_like(x)], axis=1)
         return np.asarray(rays * (self.point @ self.normal / (rays @ self.normal))[:, None])
+
+
+class BoardLens(NamedTuple):
+    """The lens by which boards fit best."""
+
+    focal: float
+    """Focal length over that of the camera."""
+    focal_sigma: float
+    bent_focal: float
+    """The same where k1 is free too."""
+    bent_focal_sigma: float
+    k1: float
+    """Radial distortion beside that of the camera."""
+    k1_sigma: float
+    k1_px: float
+    """What k1 moves the outermost corner by, pixels."""
 
 
 class LightPlane(NamedTuple):
@@ -81,9 +103,9 @@ def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, ca
     return BoardPlane(point, normal if normal @ point < 0 else -normal, float(np.sqrt((off**2).sum(axis=1).mean())))
 
 
-def focal_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> tuple[float, float] | None:
-    """Return the focal length of a camera by which boards fit best, over its own, and the standard deviation of that ratio; the rest of the
-    lens stays. None from fewer than three boards, or where they do not tell. `corners`, `board`: as of `board_plane`, of each board."""
+def lens_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> BoardLens | None:
+    """Return the lens of a camera by which boards fit best; what is not measured stays. None from fewer than three boards, or where they do
+    not tell. `corners`, `board`: as of `board_plane`, of each board."""
     if len(corners) < LEAST_BOARDS:
         return None
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
@@ -94,16 +116,22 @@ def focal_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m:
         x, y = camera.plane_at(*own[known].T)
         points.append(every[known])
         seen.append((UNIT_PX * np.stack([x, -y], axis=1)).astype(np.float32))
-    matrix = np.diag([UNIT_PX, UNIT_PX, 1.0])
-    fixed = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    fixed = (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
+             | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
+    told: list[float] = []
     try:
-        _, found, _, _, _, spread, _, _ = cv2.calibrateCameraExtended(
-            points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), matrix, np.zeros(5),
-            flags=fixed | cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
+        for flags in (fixed | cv2.CALIB_FIX_K1, fixed):
+            _, matrix, bent, _, _, spread, _, _ = cv2.calibrateCameraExtended(
+                points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), np.diag([UNIT_PX, UNIT_PX, 1.0]), np.zeros(5), flags=flags)
+            told += [float(matrix[0, 0]) / UNIT_PX, float(spread[:2].max()) / UNIT_PX, float(bent.ravel()[0]), float(spread.ravel()[4])]
     except cv2.error:
         return None
-    ratio, sigma = float(found[0, 0]) / UNIT_PX, float(spread.max()) / UNIT_PX
-    return (ratio, sigma) if np.isfinite([ratio, sigma]).all() and ratio > 0 else None
+    focal, focal_sigma, _, _, bent_focal, bent_focal_sigma, k1, k1_sigma = told
+    if not np.isfinite(told).all() or min(focal, bent_focal) <= 0:
+        return None
+    farthest = max(float(np.hypot(*own.T).max()) for own in seen) / UNIT_PX
+    assert camera.focal_px is not None
+    return BoardLens(focal, focal_sigma, bent_focal, bent_focal_sigma, k1, k1_sigma, abs(k1) * farthest**3 * max(camera.focal_px))
 
 
 def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
@@ -116,32 +144,57 @@ def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, 
     return filled.astype(bool)
 
 
-def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
-    """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each.
-    Raises CalibrationError if there are too few points, or they lie along one line."""
-    points = np.concatenate([np.zeros((0, 3)), *poses])
-    if len(poses) < 2 or len(points) < LEAST_POINTS:
-        raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {len(points)} places: two boards and {LEAST_POINTS} "
-                               "places are needed")
+def fit_light_plane(poses: list[np.ndarray], names: Sequence[str] = ()) -> LightPlane:
+    """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each. `names`: of the boards, for a message.
+    Raises CalibrationError if there are too few points, or they lie along one line or in no plane."""
+    count = sum(map(len, poses))
+    if len(poses) < 2 or count < LEAST_POINTS:
+        raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {count} places: two boards and {LEAST_POINTS} places are "
+                               "needed")
+    middle, normal, residual, breadth = _plane(poses)
+    near = CAUCHY * MAD_TO_SIGMA * float(np.median(np.abs((np.concatenate(poses) - middle) @ normal))) + 1e-9
+    agree = sum(float(np.median(np.abs((own - middle) @ normal))) < near for own in poses)
+    if agree < min(LEAST_OTHERS, len(poses)):  # two agree on some plane whichever they are: what all miss theirs by counts
+        residual = _plane(poses, rounds=1)[2]
+    straight = float(np.median([_scatter(own) for own in poses]))
+    # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
+    noise = max(residual, straight)
+    # a board whose pose is off moves all its points: the boards are the independent measurements
+    sigma = math.degrees(math.atan2(max(noise, 1e-9), max(breadth, 1e-12))) / math.sqrt(max(len(poses) - 1, 1))
+    if sigma > LARGEST_SIGMA_DEGREES:
+        if residual > APART * straight:
+            raise CalibrationError(f"its stripes miss any common plane by {1000 * residual:.2g} mm, and each is straight to "
+                                   f"{1000 * straight:.2g} mm{_to_blame(poses, names)}: check the order of the frames of each "
+                                   "pose, and that board and laser stood still while they were taken")
+        raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
+                               "board towards the camera and away from it")
+    return LightPlane(middle, normal, residual, max(noise, 1e-9) / math.sqrt(len(poses)), sigma, count)
+
+
+def _plane(poses: Sequence[np.ndarray], rounds: int = ROUNDS) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Return a point, the normal, the root mean square distance of the points, and that along their second direction, by robust weights;
+    by none in a single round."""
+    points = np.concatenate(poses)
     # every board counts alike, however much of the stripe it shows
     share = np.concatenate([np.full(len(own), 1 / len(own)) for own in poses])
     weight = share.copy()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         middle = weight @ points / weight.sum()
         values, vectors = np.linalg.eigh((points - middle).T @ ((points - middle) * weight[:, None]) / weight.sum())
         normal = vectors[:, 0]
         off = (points - middle) @ normal
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off))) + 1e-9
         weight = share / (1 + (off / (CAUCHY * spread)) ** 2)
-    residual = math.sqrt(max(float(values[0]), 0.0))
-    # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
-    noise = max(residual, float(np.median([_scatter(own) for own in poses])))
-    # a board whose pose is off moves all its points: the boards are the independent measurements
-    sigma = math.degrees(math.atan2(max(noise, 1e-9), math.sqrt(max(float(values[1]), 1e-24)))) / math.sqrt(max(len(poses) - 1, 1))
-    if sigma > LARGEST_SIGMA_DEGREES:
-        raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
-                               "board towards the camera and away from it")
-    return LightPlane(middle, normal, residual, max(noise, 1e-9) / math.sqrt(len(poses)), sigma, len(points))
+    return middle, normal, math.sqrt(max(float(values[0]), 0.0)), math.sqrt(max(float(values[1]), 0.0))
+
+
+def _to_blame(poses: Sequence[np.ndarray], names: Sequence[str]) -> str:
+    """Return words that name the board without which the stripes of the others lie in one plane; nothing where there is none."""
+    if len(poses) <= LEAST_OTHERS or len(names) != len(poses):
+        return ""
+    left = [_plane([*poses[:one], *poses[one + 1 :]], rounds=1)[2] for one in range(len(poses))]
+    first, second = np.argsort(left)[:2]
+    return f"; without that of {names[first]} the others lie in one plane" if APART * left[first] < left[second] else ""
 
 
 def _scatter(points: np.ndarray) -> float:

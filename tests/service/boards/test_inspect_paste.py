@@ -15,6 +15,7 @@ from service.boards.shared_print import shared_sentences
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from stage.errors import BoardError
 from stage.formats.gerber import read_pads
+from tests.scenes.board import write_depth
 from tests.scenes.paste_layer import write_drill, write_layer
 from tests.scenes.printed_board import PADS, PASTE, PIXEL, SIGMA, THICK, Print, measured, surface, write_board
 
@@ -174,6 +175,41 @@ def test_errors_are_as_large_as_their_sigma(tmp_path):
                 score[axis].append(error / np.sqrt(variance))
     for name, values in score.items():  # the place of an outline is stated for sensors that do not average over a pixel as evenly
         assert 0.2 < np.sqrt(np.mean(np.square(values))) < 1.4, name
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
+def test_tiles_whose_shifts_are_unsure_tell_the_paste_of_whole_pads(relit, tmp_path, seed):
+    """Five tiles with two pads each and bare overlaps lie .55 pixels off, as the stage says: volumes were known to 31 %, and all pads
+    undecided. Flanks of width w about a rectangle hold w² / 3 more, and the mean above half of the height is less by a quarter of w times
+    the outline over twice the area."""
+    rng = np.random.default_rng(seed)
+    wide, unsure, step = 4e-5, 0.55 * PIXEL, 60 * PIXEL
+    places = [((number - 2) * step, y) for number in range(5) for y in (-4e-4, 4e-4)]
+    thick = [0.7 if number == 3 else 1.0 for number in range(10)]
+    entries = []
+    for tile in range(5):
+        x, y = np.meshgrid((np.arange(72) - 35.5) * PIXEL + (tile - 2) * step + unsure * rng.standard_normal(),
+                           (79.5 - np.arange(160)) * PIXEL + unsure * rng.standard_normal())
+        height = SIGMA * rng.standard_normal(x.shape) + 1e-6 * rng.standard_normal()
+        for (px, py), part in zip(places, thick, strict=True):
+            inside = np.minimum(PASTE[0] / 2 - np.abs(x - px), PASTE[1] / 2 - np.abs(y - py))
+            height += np.clip(inside / wide + 0.5, 0, 1) * part * THICK
+        write_depth(tmp_path / str(tile) / "depth.exr", height, sigma=SIGMA, pixel=PIXEL)
+        entries.append({"path": str(tile), "position_m": [(tile - 2) * step, 0.0]})
+    (tmp_path / "board.json").write_text(json.dumps({"schema": "relit.board-scan/1", "name": "row", "stage_sigma_m": unsure,
+                                                     "tiles": entries}))
+    _, pads, _ = inspect(relit, tmp_path, "--paste", write_layer(tmp_path / "paste.gbr", pads=places),
+                         "--limits", limits(tmp_path / "limits.json", fine={**WIDE, "offset_percent": 25}))
+    assert [pad["verdict"] for pad in pads.values()] == ["fail" if part < 1 else "pass" for part in thick]
+    rim = wide * (PASTE[0] + PASTE[1]) / np.prod(PASTE)
+    for pad, part in zip(pads.values(), thick, strict=True):
+        truths = {"volume_percent": 100 * part * (1 + wide**2 / 3 / np.prod(PASTE))}
+        if part == 1:
+            truths |= {"area_percent": 100.0, "height_percent": 100 * (1 - rim / 4)}
+        for name, truth in truths.items():
+            sigma = float(pad[f"{name}_sigma"])
+            assert abs(float(pad[name]) - truth) < 3 * sigma < 12, name
 
 
 def test_paste_that_fits_its_openings_at_several_places_is_refused():
