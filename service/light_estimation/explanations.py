@@ -48,6 +48,8 @@ SCALE_ROUNDS, FREE_ROUNDS = 12, 12
 """Rounds of alternating least squares."""
 MEASURED_EVERY = 3
 """Every third pixel suffices to measure the brightness, whose rounds are many."""
+STEADY_EVERYWHERE = 0.9
+"""Least part of the pixels that reflect light which all images share: it adds to every reading."""
 PLENTY = 60
 """Least count of pixels, seen by most lights, from which free directions are started."""
 
@@ -63,6 +65,7 @@ class Cause(Enum):
     REVERSED = "the lights are in reverse order"
     SHIFTED = "the lights are one frame off"
     DIRECTIONS = "directions and images do not belong together"
+    STEADY = "light is on in all images that is not that of their lamps"
 
 
 class Explanation(NamedTuple):
@@ -79,6 +82,8 @@ class Explanation(NamedTuple):
     """Standard deviation of the logarithm of the brightness that the images ask for."""
     space: str = ""
     """Colour space that would declare the encoding; empty where the encoding is not the cause."""
+    part: float = 0.0
+    """Median of the light that all images share, over that of a lamp which a pixel faces."""
 
 
 class Sample(NamedTuple):
@@ -113,7 +118,9 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
             return brightness
         return brightness._replace(cause=Cause.ENCODED_OR_IRRADIANCE, degrees=max(brightness.degrees, encoding.degrees),
                                    space=encoding.space)
-    return _free_directions(sample, given) if count >= MIN_LIGHTS_FREE else None
+    free = _free_directions(sample, given) if count >= MIN_LIGHTS_FREE else None
+    steady = None if free is None else _steady_light(sample, given, free)
+    return steady or free
 
 
 def _explains(left: float, misfit: float, times: float) -> bool:
@@ -250,6 +257,21 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
 
 
+def _steady_light(sample: Sample, given: Fit, free: Explanation) -> Explanation | None:
+    """Return the light that all images share, if the declared directions and it explain them as free directions do."""
+    shared = grey_readings(np.ones((len(sample.directions), 1, 3)), sample.irradiance)  # the same radiance in all images, as readings
+    shared /= shared.mean()
+    fit = fit_lambertian(grey_readings(sample.radiance, sample.irradiance), sample.usable, np.hstack([sample.directions, shared]))
+    chosen = fit.lit.sum(axis=0) >= MIN_READINGS_FREE
+    misfit, left = given.misfit(chosen), fit.misfit(chosen)
+    length = np.maximum(np.linalg.norm(fit.vector[:3], axis=0), TINY)
+    part = (fit.vector[3] / length)[chosen]
+    if not _explains(left, misfit, TIMES_FREE) or left > ABOUT * free.left or (part > 0).mean() < STEADY_EVERYWHERE:
+        return None
+    turned = degrees_between(given.normal, fit.vector[:3] / length)[chosen]
+    return Explanation(Cause.STEADY, misfit, left, float(np.median(turned)), part=float(np.median(part)))
+
+
 def explanation_sentence(found: Explanation, sample: Sample) -> str:
     """Return the sentence for what explains the images better than the manifest."""
     fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
@@ -272,4 +294,7 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
                        "light belongs to which image",
         Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
                           "check which light belongs to which image, and the directions",
+        Cause.STEADY: f"frames: the images look to share light that is not that of their lamps, {100 * found.part:.0f} % of what a lamp "
+                      f"gives that a pixel faces, as light of the room or a black level: without it, {fits}; add an image with all lamps "
+                      "off as a frame of light off, or give dark",
     }[found.cause]

@@ -98,10 +98,10 @@ class Fit(NamedTuple):
 def fit_lambertian(
     readings: np.ndarray,  # [lights, pixels] radiance over irradiance
     usable: np.ndarray,  # [lights, pixels] bool, True for unsaturated readings
-    directions: np.ndarray,  # [lights, 3] unit
+    directions: np.ndarray,  # [lights, 3] unit, or [lights, n] with what else adds to each reading
     rounds: int = ROUNDS,
 ) -> Fit:
-    """Fit b·l to the readings of each pixel by re-weighted least squares with Cauchy weights."""
+    """Fit b·l to the readings of each pixel by re-weighted least squares with Cauchy weights; of n columns b has n numbers."""
     lit = usable & (readings > SHADOW * bright_readings(readings, usable)) & (readings > 0)
     weight = lit.astype(np.float64)
     for _ in range(rounds):
@@ -113,15 +113,17 @@ def fit_lambertian(
 
 
 def normal_equations(weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return Σ weight basis basisᵀ of each column, [columns, 3, 3]."""
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
-    return np.asarray((weight.T @ outer).reshape(-1, 3, 3))
+    """Return Σ weight basis basisᵀ of each column, [columns, n, n] of a basis [readings, n]."""
+    count = basis.shape[1]
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, count * count)
+    return np.asarray((weight.T @ outer).reshape(-1, count, count))
 
 
 def least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
-    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight."""
+    """Return the [n, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight.
+    `basis`: [readings, n]."""
     gram = normal_equations(weight, basis)
-    gram += (ridge * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
+    gram += (ridge * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(basis.shape[1])
     return np.asarray(np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T)
 
 

@@ -10,7 +10,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
+from service.light_estimation.explanations import MIN_PART, PIXELS, grey_readings
+from service.light_estimation.lambertian import fit_lambertian
 from service.requests.solve import Method
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.lights.highlight_turn import LEAST_LIGHTS, Shown, turn_by_highlights
@@ -22,6 +25,8 @@ Lights = TypeVar("Lights", DistantLights, PlacedLights)
 
 LEAST_DEGREES, LARGEST_DEGREES = 1.5, 20.0
 """Least turn that is remarked on, and the largest that is one: metal and velvet, which no Lambertian fit explains, make up larger ones."""
+LARGEST_MATT, LARGEST_MISFIT = 75.0, 0.025
+"""Largest turn by slopes of a surface whose readings fit Lambert's law to the second number: metal leaves 0.13 to 0.2, velvet 0.045."""
 APART = 3.0
 """Standard deviations by which turns by slopes and by highlights may differ, where there are highlights; beyond them slopes are bent by
 what the model lacks."""
@@ -91,7 +96,20 @@ def find_turn(given: SolveInput, lights: DistantLights | PlacedLights, solution:
         found.append((shown.right, shown.covariance))
     turns = [Turn(right, covariance + MODEL**2 * np.eye(3)) for right, covariance in found]
     likely = [turn for turn in turns if LEAST_DEGREES <= np.degrees(turn.right.magnitude()) <= LARGEST_DEGREES]
+    if not likely and by_slopes is not None and LARGEST_DEGREES < np.degrees(by_slopes[0].magnitude()) <= LARGEST_MATT and _is_matt(
+            given, lights, solved):
+        return Turn(by_slopes[0], by_slopes[1] + MODEL**2 * np.eye(3))
     return min(likely, key=lambda turn: turn.sigma_degrees, default=None)
+
+
+def _is_matt(given: SolveInput, lights: DistantLights | PlacedLights, solved: np.ndarray) -> bool:
+    """Return whether the readings of solved pixels [pixels of the image] bool fit Lambert's law, which many distant lights can tell."""
+    if not isinstance(lights, DistantLights) or len(lights.direction) < LEAST_LIGHTS:
+        return False
+    pixels = np.flatnonzero(solved)
+    radiance, usable = given.stack.pick_radiance(pixels[evenly(len(pixels), PIXELS)])
+    fit = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
+    return bool(fit.spare.mean() >= MIN_PART and fit.misfit() <= LARGEST_MISFIT)
 
 
 def _nearness(lights: DistantLights | PlacedLights, height: np.ndarray | None) -> Nearness | None:

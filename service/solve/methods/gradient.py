@@ -20,6 +20,7 @@ from kernels.status import Status
 from service.sharing.sharing import Results
 from service.solve.base.batches import each_span, view_directions
 from service.solve.base.solution import Solution, SolveInput, half
+from service.solve.methods.gradient_doubts import gradient_doubts
 from stage.capture.camera import Camera
 from stage.capture.gradients import GradientFrames
 from stage.colour.colour import GREY_WEIGHTS
@@ -90,6 +91,9 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))
     result.sigma[estimated] = np.minimum(doubted[estimated], LARGEST_ERROR)
     result.facts = _facts(frames, result, length, separated, metal)
+    result.warnings += gradient_doubts(stack, inside, frames)
+    if result.warnings:
+        result.sigma[metal] = LARGEST_ERROR  # nothing else checks highlights
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
     return result

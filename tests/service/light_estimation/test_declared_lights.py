@@ -11,25 +11,25 @@ from service.relight.relight import relight
 from service.requests.basis import BasisRequest
 from service.requests.captures import InfoRequest
 from service.requests.relight import RelightRequest
-from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr
+from tests.scenes.captures import edit_manifest, make_scene, render, write_capture, write_exr
 
 SCENE = make_scene(size=32, lights=12)
 AXES = {"x": np.eye(3)[[2, 1, 0]], "y": np.eye(3)[[0, 2, 1]], "-z": -np.eye(3)}
 """What the true directions are multiplied by, by the axis that then looks like the one towards the camera."""
 
 
-def declared(folder, change):
+def declared(folder, change, scene=SCENE):
     """Write the capture with other directions, and return what is said of its lights by info, frames and a basis."""
-    write_capture(folder, SCENE)
+    write_capture(folder, scene)
     frames = json.loads((folder / "capture.json").read_text())["frames"]
-    for frame, direction in zip(frames, change(SCENE.directions), strict=True):
+    for frame, direction in zip(frames, change(scene.directions), strict=True):
         frame["light"]["direction"] = direction.tolist()
     edit_manifest(folder, frames=frames)
     write_exr(folder.parent / "sky.exr", np.full((16, 32, 3), 0.3, np.float32))
     frame = relight(RelightRequest(capture=folder, environment=str(folder.parent / "sky.exr"), out=str(folder.parent / "frame.#.exr"),
                                    device="cpu"))
     basis = make_basis(BasisRequest(capture=folder, out=folder.parent / "basis.exr", device="cpu"))
-    return [[each for each in said if each.startswith("frames[].light")]
+    return [[each for each in said if each.startswith("frames")]
             for said in (inspect(InfoRequest(capture=folder)).findings, frame.warnings, basis.warnings)]
 
 
@@ -42,6 +42,19 @@ def test_axes_along_which_nothing_faces_the_camera_are_named(tmp_path, axis):
 def test_lights_in_another_order_are_named(tmp_path):
     for said in declared(tmp_path / "capture", lambda directions: np.random.default_rng(0).permutation(directions)):
         assert len(said) == 1 and "images and directions do not belong together" in said[0]
+
+
+def test_light_that_is_on_in_all_images_is_named(tmp_path):
+    """Light from above, of half a lamp: other directions than the declared ones explain it as well."""
+    number = np.arange(24) + 0.5
+    z, turn = 1 - 0.75 * number / 24, np.pi * (1 + 5**0.5) * number
+    around = np.sqrt(1 - z**2)
+    scene = SCENE._replace(directions=np.stack([around * np.cos(turn), around * np.sin(turn), z], axis=1), irradiance=np.ones((24, 3)))
+    images = render(scene.normal, scene.albedo, scene.directions, scene.irradiance)
+    room = 0.5 / np.pi * scene.albedo * (0.5 + 0.5 * scene.normal[..., 1:2])
+    for said in declared(tmp_path / "room", lambda directions: directions, scene._replace(images=images + room)):
+        assert len(said) == 1 and "share light that is not that of their lamps" in said[0] and "frame of light off" in said[0]
+    assert declared(tmp_path / "none" / "capture", lambda directions: directions, scene._replace(images=images)) == [[], [], []]
 
 
 def test_right_lights_leave_nothing_to_say(tmp_path):

@@ -62,6 +62,14 @@ def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how
     assert np.median(error) > 2 and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
 
 
+@pytest.mark.parametrize("turn", [(30, 0, 0), pytest.param((0, -45, 0), marks=pytest.mark.long)])
+def test_matt_surfaces_tell_larger_turns(tmp_path, turn):
+    """They were taken for what metals make up: normals were wrong by 27° at a σ of 2°, without a word."""
+    error, sigma, report = solved(tmp_path, "matt", turn)
+    assert np.abs(np.add(report["found"]["light_turn"]["turn_degrees"], turn)).max() < BACK
+    assert np.median(error) > 10 and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["few lights", "glossy"])
 def test_lights_are_turned_back(tmp_path, name):

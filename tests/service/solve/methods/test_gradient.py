@@ -127,6 +127,25 @@ def test_a_lamp_in_the_picture_is_bright_and_leaves_maps_that_can_be_read(relit,
     assert maps.diffuse_albedo[inside].max() == np.finfo(np.float16).max
 
 
+@pytest.mark.parametrize(("full", "signs", "said"), [
+    (1.0, (1, -1), None), (1.0, (1,), None), (0.7, (1, -1), "axis x add up to 1.43 times the full frame"),
+    (0.7, (1,), "a gradient, is brighter than the full frame")])
+def test_a_full_frame_of_another_exposure_is_named(relit, tmp_path, diffuse, full, signs, said):
+    """Without it nothing was said, and where highlights were told apart normals were 15° off at a σ of 4°."""
+    kept = [number for number, (_, sign) in enumerate(PAIRS) if sign in signs]
+    lights = [{"type": "gradient", "axis": PAIRS[n][0], "sign": PAIRS[n][1]} for n in kept] + [{"type": "full"}]
+    write_lit(tmp_path, np.concatenate([diffuse[kept], full * (diffuse[:1] + diffuse[1:2])]), lights, mask=SCENE.mask, camera=CAMERA)
+    outcome = relit("solve", tmp_path, "--out", tmp_path / "out", "--method", "gradient")
+    warnings = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"]
+    assert outcome.err == "" and [said in each for each in warnings if each.startswith("frames: ")] == ([] if said is None else [True])
+
+
+def test_polarisers_that_are_exchanged_are_named(relit, tmp_path, diffuse, highlight):
+    write(tmp_path, {"cross": diffuse / 2 + highlight, "parallel": diffuse / 2})
+    relit("solve", tmp_path, "--out", tmp_path / "out", "--method", "gradient")
+    assert "cross images are brighter than the parallel ones" in (tmp_path / "out" / "report.json").read_text()
+
+
 def test_a_perspective_camera(relit, tmp_path, diffuse):
     camera = {"projection": "perspective", "resolution": [SIZE, SIZE], "focal_px": [40, 40], "principal_px": [6, 6]}
     write(tmp_path, {"cross": diffuse / 2}, camera=camera)
