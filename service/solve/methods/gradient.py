@@ -91,8 +91,9 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))
     result.sigma[estimated] = np.minimum(doubted[estimated], LARGEST_ERROR)
     result.facts = _facts(frames, result, length, separated, metal)
-    result.warnings += gradient_doubts(stack, inside, frames)
-    if result.warnings:
+    doubts = gradient_doubts(stack, inside, frames)
+    result.warnings += doubts
+    if doubts:
         result.sigma[metal] = LARGEST_ERROR  # nothing else checks highlights
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
