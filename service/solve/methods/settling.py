@@ -70,7 +70,7 @@ class Settled(NamedTuple):
 class Middles(NamedTuple):
     """The solved pixels in square blocks, and one pixel of each block."""
 
-    solved: np.ndarray  # [pixels] bool
+    solved: np.ndarray  # [rows, cols] bool
     block: np.ndarray  # [solved] number of the block of each
     pixels: np.ndarray  # [blocks] position of the pixel nearest to the middle of each
     readings: np.ndarray  # [blocks, lights] of that pixel
