@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kernels.device import to_numpy
 from kernels.photometric.model.samples import Samples, readings_of
@@ -46,6 +47,8 @@ hardly any is expected."""
 UNKNOWN_STRENGTH = 0.5
 """Relative error of the strength where shadows do not tell it: 1.2 to 2.5 times the light of the form factors arrives in glossy folds, and
 1.0 to 1.2 times in matt ones."""
+NEIGHBOURS = 5
+"""Blocks, of which the median tells by how much an unknown strength turns normals: one pixel alone may jump to another normal."""
 SHADOW_PART = 0.1
 """Part of the mean of a pixel's readings below which a reading is not lit."""
 
@@ -135,8 +138,10 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     settled = light._replace(albedo_scale=_value(found))
     unknown = UNKNOWN_STRENGTH if found is None else math.hypot(RELATIVE_NOISE, found.sigma / found.scale)
     ends = [searched(settled._replace(albedo_scale=times * settled.albedo_scale), turned)[1] for times in (1.0, 1 + unknown)]
+    places = np.stack(np.divmod(middles, light.given.camera.width), axis=1)
+    nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
     degrees = np.zeros(solved.size, np.float32)
-    degrees[pixels] = degrees_between(*(end.T for end in ends))[block]
+    degrees[pixels] = np.median(degrees_between(*(end.T for end in ends))[nearest], axis=1)[block]
     return Settled(settled, found, degrees)
 
 

@@ -60,8 +60,8 @@ def test_the_demo_and_the_truth_of_the_owl(relit, tmp_path):
     (median; 4.1 mean) from the pixel's mean normal (samples/README.md), and no solver of pixels can be nearer. Each limit is a
     tenth above what was measured when this was written."""
     errors = owl_errors(run(relit, tmp_path / "out"))
-    assert errors.solved > 0.998  # forty of 37 096 pixels are unsure: their standard error is above 30 degrees
-    assert np.median(errors.normal) < 3.9 and errors.normal.mean() < 7.3  # 3.55 and 6.63 degrees
+    assert errors.solved == 1
+    assert np.median(errors.normal) < 3.9 and errors.normal.mean() < 7.3  # 3.56 and 6.67 degrees
     assert np.median(errors.albedo) < 0.0253  # 0.023
     assert np.median(errors.roughness) < 0.0393  # 0.0357
     assert errors.height < 0.0472  # 0.0429
