@@ -25,6 +25,8 @@ BESIDE_DEGREES, BESIDE_SIGMAS = 5.0, 3.0
 turns it by 8° at a standard error of 1.5°, gloss and rough surfaces by their standard error."""
 ALIEN, LEAST_ALIEN = 5.0, 0.02
 """Residual of a light, over the median of all and relative to readings, from which it contradicts the others; 2 where none does."""
+LEAST_CLIPPED = 0.005
+"""Part of the pixels of a ball that are clipped from which on it is said: a smaller one is 0 % in words."""
 NAMED = 5
 """The most frames that a sentence names."""
 
@@ -86,7 +88,7 @@ def with_clipped(radiance: np.ndarray, saturated: np.ndarray | None, view: BallV
         clipped = np.asarray((radiance >= level).any(axis=-1))
         saturated = clipped if saturated is None else np.asarray(saturated | clipped)
     share = 0.0 if saturated is None else float(saturated[view.inside].mean())
-    return saturated, [f"clipped at {100 * share:.0f} % of the ball"] if share >= 0.005 else []
+    return saturated, [f"clipped at {100 * share:.0f} % of the ball"] if share >= LEAST_CLIPPED else []
 
 
 def beside(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, ball: Ball, view: BallView

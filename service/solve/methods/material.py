@@ -42,7 +42,7 @@ from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
-from service.solve.methods.settling import as_shown, middles_of, settle
+from service.solve.methods.settling import settle
 from service.solve.methods.support import FEW_LIGHTS, simpler_normals, support_of
 from service.solve.methods.unseen_metals import replace_unseen_metals
 from stage.colour.colour import GREY_WEIGHTS
@@ -196,19 +196,10 @@ class _Walk:
                              parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or not self._options.settling:
             return light
-        middles = middles_of(light, self._pick)
-        light, shown = as_shown(light, self.result.normal, self._shape, self._pick, middles)
-        told = self.result.facts["bounced_light"] = {"taken_out": light.arriving is not None}
-        if shown is not None:
-            told["shown"] = round(shown, 3)
-        if light.arriving is None or self._field is not None:
-            return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale
-        settled = settle(light, self.result.normal, self._shape, self._pick, middles, relative=relative)
+        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
         self._unknown_bounce = settled.degrees
-        told["strength"] = round(settled.light.albedo_scale, 3)
-        if relative:
-            self.result.facts["albedo_scale"] = settled.report()
+        self.result.facts |= settled.report(relative=relative)
         return settled.light
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from kernels.device import to_numpy
 from kernels.photometric.model.samples import Samples, readings_of
-from kernels.photometric.search.descent import descend
+from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import Diffuse
 from service.light_estimation.lambertian import degrees_between
 from service.solve.height.direct_light import DirectLight
@@ -54,15 +54,27 @@ SHADOW_PART = 0.1
 
 
 class Settled(NamedTuple):
-    """Interreflection after the rounds."""
+    """Interreflection after the rounds, or without them where none is to be taken out or near lights settle it with the surface."""
 
     light: DirectLight
-    scale: ScaleFit | None
-    """Of albedo, or of the light that arrives; None: shadows do not decide it."""
-    degrees: np.ndarray  # [pixels] float32: by how much its unknown strength turns the normals
+    shown: float | None
+    """What shadows show of it, of `shown_bounce`."""
+    rounds: bool = False
+    scale: ScaleFit | None = None
+    """The fit by shadows of the scale of albedo, or of the light that arrives; None where they do not decide it."""
+    degrees: np.ndarray | float = 0.0
+    """By how much its unknown strength turns the normals, [pixels] float32."""
 
-    def report(self) -> dict[str, Any]:
-        """Return what the report says about the scale of albedo."""
+    def report(self, *, relative: bool) -> dict[str, Any]:
+        """Return what the report says about bounced light, and, where the lights are `relative`, about the scale of albedo."""
+        told: dict[str, Any] = {"taken_out": self.light.arriving is not None}
+        if self.shown is not None:
+            told["shown"] = round(self.shown, 3)
+        if self.rounds:
+            told["strength"] = round(self.light.albedo_scale, 3)
+        return {"bounced_light": told} | ({"albedo_scale": self._albedo_scale()} if self.rounds and relative else {})
+
+    def _albedo_scale(self) -> dict[str, Any]:
         if self.scale is None:
             return {"decided": False, "value": 1.0}
         value = min(self.scale.scale, largest_scale(self.light))
@@ -79,37 +91,46 @@ class Middles(NamedTuple):
     readings: np.ndarray  # [blocks, lights] of that pixel
 
 
-def middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Middles:
+def _middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Middles:
     """Return the middles of the blocks of an object. `pick`: gives the readings of a few pixels by their positions."""
     solved = to_numpy(light.solved) > 0
     block, pixels = _blocks(np.flatnonzero(solved), light.given.camera.width)
     return Middles(solved, block, pixels, readings_of(pick(pixels)))
 
 
-def as_shown(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples],
-             middles: Middles) -> tuple[DirectLight, float | None]:
-    """Return the light of a first search without its arriving part where the images show none; and what shadows show, of `shown_bounce`.
-    `normal`: [3, pixels]."""
-    start = normal[:, middles.pixels].T
-    shown = shown_bounce(*readings_in_shadow(light, middles.pixels, start, middles.readings))
-    without = light._replace(arriving=None)
-    if shown is not None:
-        return (light if has_bounced(light, shown) else without), shown
-
-    def cost(light: DirectLight) -> float:
-        samples = pick(middles.pixels)
-        light.keep(middles.pixels, samples)
-        return float(descend(samples, start, shape=shape).cost.mean(dtype=np.float64))
-
-    whole, direct = cost(without), cost(light)
-    return (without if whole < min(BETTER * direct, direct - LEAST_GAIN) else light), None
-
-
-def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], within: Middles, *,
-           relative: bool) -> Settled:
+def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
     """Find the light that an object throws on itself from the surface without it.
-    `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: as for `middles_of`, of which `within` is.
-    `relative`: whether the scale of the lights, and so of albedo, is unknown."""
+    `light`: of a first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
+    positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
+    within = _middles_of(light, pick)
+    shown = shown_bounce(*readings_in_shadow(light, within.pixels, normal[:, within.pixels].T, within.readings))
+    if not (has_bounced(light, shown) if shown is not None else _is_lit_by_bounces(light, normal, shape, pick, within)):
+        return Settled(light._replace(arriving=None), shown)
+    if light.field is not None:
+        return Settled(light, shown)
+    return _in_rounds(light, normal, shape, pick, within, relative=relative)._replace(shown=shown)
+
+
+def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples]
+              ) -> tuple[Samples, Descent]:
+    """Return the readings of some pixels in direct light, and their descents from `start` [n, 3]."""
+    samples = pick(pixels)
+    light.keep(pixels, samples)
+    return samples, descend(samples, start, shape=shape)
+
+
+def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples],
+                       within: Middles) -> bool:
+    """Return whether lit readings leave it possible that light has bounced; parameters as of `settle`."""
+    start = normal[:, within.pixels].T
+    whole, direct = (float(_searched(each, within.pixels, start, shape, pick)[1].cost.mean(dtype=np.float64))
+                     for each in (light._replace(arriving=None), light))
+    return whole >= min(BETTER * direct, direct - LEAST_GAIN)
+
+
+def _in_rounds(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], within: Middles, *,
+               relative: bool) -> Settled:
+    """Return the light after the rounds; parameters as of `settle`."""
     assert light.arriving is not None
     solved, block, middles, whole = within
     pixels = np.flatnonzero(solved)
@@ -120,29 +141,26 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole))
         return fit if relative or fit is None else fit._replace(scale=min(fit.scale, LARGEST_STRENGTH))
 
-    def searched(light: DirectLight, start: np.ndarray) -> tuple[Samples, np.ndarray]:
-        samples = pick(middles)
-        light.keep(middles, samples)
-        return samples, descend(samples, start, shape=shape).normal
-
     for _ in range(ROUNDS):
         fit = of_shadows()
         light = light._replace(albedo_scale=_value(fit))
-        samples, turned = searched(light, start)
+        samples, found = _searched(light, middles, start, shape, pick)
+        turned = found.normal
         again, dimmed = first.copy(), albedo.copy()
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
-    found = of_shadows()
-    settled = light._replace(albedo_scale=_value(found))
-    unknown = UNKNOWN_STRENGTH if found is None else math.hypot(RELATIVE_NOISE, found.sigma / found.scale)
-    ends = [searched(settled._replace(albedo_scale=times * settled.albedo_scale), turned)[1] for times in (1.0, 1 + unknown)]
+    fit = of_shadows()
+    settled = light._replace(albedo_scale=_value(fit))
+    unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale)
+    ends = [_searched(settled._replace(albedo_scale=times * settled.albedo_scale), middles, turned, shape, pick)[1].normal
+            for times in (1.0, 1 + unknown)]
     places = np.stack(np.divmod(middles, light.given.camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
     degrees = np.zeros(solved.size, np.float32)
     degrees[pixels] = np.median(degrees_between(*(end.T for end in ends))[nearest], axis=1)[block]
-    return Settled(settled, found, degrees)
+    return Settled(settled, None, True, fit, degrees)
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

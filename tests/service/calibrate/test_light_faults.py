@@ -75,7 +75,7 @@ def test_a_lamp_that_did_not_change_is_said(relit, tmp_path):
 
 
 def test_radii_that_are_exchanged_are_said_and_held_by_sigma(relit, tmp_path):
-    """Of two balls before a perspective camera: positions were off by up to 21 times what was stated."""
+    """Two balls stand before a perspective camera. Positions were off by up to 21 times what was stated."""
     camera = {"focal": 400.0, "width": 200, "height": 80}
     positions = np.array([[0.3, 0.25, -0.5], [-0.25, -0.2, -0.4], [0.1, 0.35, -0.45], [0.25, -0.2, -0.35]])
     balls = [(np.array([-0.12, 0.0, -1.0]), 0.07), (np.array([0.13, 0.01, -1.02]), 0.06)]

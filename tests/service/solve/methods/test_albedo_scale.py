@@ -172,7 +172,7 @@ def test_lit_readings_tell_where_no_shadow_does(bounced, tmp_path):
 
 
 def test_sigma_holds_a_strength_that_no_shadow_tells(tmp_path):
-    """Of lights within 40° declared 1.5 times too strong, two thirds of the bounce are taken out: the groove is open by some degrees."""
+    """Lights within 40° are declared 1.5 times too strong, so two thirds of the bounce are taken out: the groove is open by degrees."""
     result, error, _ = solved(groove_capture(tmp_path, scale=1.5, declared=None, widest=40.0), tmp_path / "out")
     assert np.median(error) > 2
     assert np.percentile(error / result.maps.sigma, 95) < 2.5

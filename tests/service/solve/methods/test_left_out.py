@@ -54,8 +54,8 @@ def test_noise_in_shadows_is_predicted_by_middle_ranks(device):
 
 
 def test_simpler_normals_follow_the_readings_that_they_are_given(device):
-    """Of a matt surface both simpler methods have the normal, to half floats; where one reading is three times too bright, that of middle
-    ranks has it, and least squares does not."""
+    """Both simpler methods find the normal of a matt surface, to half floats. Where one reading is three times too bright, `robust` still
+    does, and `lambert` does not."""
     normal = tilted(96, 30.0)
     radiance = render(normal, f0=None, lights=LIGHTS)
     brightest = np.zeros(len(LIGHTS))
