@@ -11,7 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.grey_ball import ENCODINGS, other_readings
-from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, degrees_between, fit_lambertian, least_squares, median_of
+from service.light_estimation.lambertian import (
+    LEAST_APART,
+    SHADOW,
+    Fit,
+    bright_readings,
+    degrees_between,
+    fit_lambertian,
+    least_squares,
+    median_of,
+    unlike_most,
+)
 from service.light_estimation.semi_calibrated import TINY, fit_intensities
 from stage.colour.colour import GREY_WEIGHTS
 from stage.colour.colour_spaces import is_linear
@@ -127,12 +137,6 @@ def _explains(left: float, misfit: float, times: float) -> bool:
     return left <= LARGEST_LEFT and misfit >= times * left
 
 
-def _apart(given: Fit) -> np.ndarray | None:
-    """Return the pixels [pixels] that face otherwise than most, which must agree with an explanation; None: they are too few."""
-    apart = given.apart
-    return apart if apart.sum() >= MIN_PIXELS else None
-
-
 def _angle(one: Fit, other: Fit) -> float:
     return float(np.median(degrees_between(one.normal, other.normal)))
 
@@ -200,7 +204,8 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
     left = free.misfit()
     if np.log(factor).std() < LEAST_SPREAD or not _explains(left, misfit, TIMES_FREE):
         return None
-    if (apart := _apart(given)) is not None and not _explains(free.misfit(apart), given.misfit(apart), TIMES_FREE):
+    apart = free.apart  # under the declared brightness, normals of a metal plane seem to differ
+    if apart.sum() >= LEAST_APART and given.misfit(apart) < TIMES_FREE * free.misfit(apart):
         return None
     # the alternation stops half-way: enough to see that brightness explains the images, but not how far the normals are off
     try:
@@ -251,8 +256,11 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     free, misfit = misfits(lit)
     if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
         return None
-    if (apart := _apart(given)) is not None and not _explains(*misfits(lit & apart), TIMES_FREE):
-        return None
+    apart = unlike_most(lights @ surface)
+    if apart.sum() >= LEAST_APART:
+        explained, declared = misfits(lit & apart)
+        if declared < TIMES_FREE * explained:
+            return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
 

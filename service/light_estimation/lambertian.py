@@ -31,7 +31,9 @@ most pixels."""
 LEAST_PIXELS = 20
 """Least number of these pixels that must see a light for it to be judged."""
 ALIKE, APART = np.cos(np.radians(10)), np.cos(np.radians(15))
-"""Cosines of the angles within which normals count as one, and beyond which they face otherwise."""
+"""Cosines of the angles within which normals, or patterns of readings, count as one, and beyond which they are others."""
+LEAST_APART = 20
+"""Number of pixels that face otherwise than most from which on they must agree with what explains the others."""
 SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
 """A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
 lights."""
@@ -83,16 +85,21 @@ class Fit(NamedTuple):
 
     @property
     def apart(self) -> np.ndarray:
-        """Return whether each pixel faces otherwise than most, [pixels] bool. Highlights of a plane look like other lights to all of its
-        pixels: only those that face otherwise tell."""
-        normal = self.normal
-        commonest = normal[:, (normal.T @ normal > ALIKE).sum(axis=0).argmax()]
-        return np.asarray(commonest @ normal < APART)
+        """Return whether each pixel faces otherwise than most, [pixels] bool."""
+        return unlike_most(self.vector)
 
     def misfit(self, pixels: np.ndarray | bool = True) -> float:
         """Return the robust standard deviation of the residuals of pixels [pixels] with readings to spare; NaN without any."""
         chosen = self.lit & self.spare & pixels
         return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
+
+
+def unlike_most(vectors: np.ndarray) -> np.ndarray:
+    """Return which of some vectors [n, pixels], normals or patterns of readings, are not as most are, [pixels] bool. Highlights of a plane
+    look like other lights to all of its pixels: only those that face otherwise tell."""
+    unit = vectors / np.maximum(np.linalg.norm(vectors, axis=0), 1e-300)
+    commonest = unit[:, (unit.T @ unit > ALIKE).sum(axis=0).argmax()]
+    return np.asarray(commonest @ unit < APART)
 
 
 def fit_lambertian(

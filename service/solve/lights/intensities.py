@@ -18,7 +18,7 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.light_factors import untold
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import fit_lambertian
+from service.light_estimation.lambertian import LEAST_APART, fit_lambertian
 from service.light_estimation.semi_calibrated import fit_grey_intensities, part_uncertainty, shades_alike
 from service.solve.base.solution import SolveInput
 from stage.capture.point_lights import DistantLights
@@ -35,9 +35,9 @@ LEAST_LIGHTS = 8
 LEAST_GAIN = 0.4
 """Least part of the cost of left-out pixels that other intensities must take away: where the declared ones are right, up to 0.3 goes on
 real objects, which are not quite Lambertian; errors of 5 % take away 0.5 to 0.8, and 0.26 on a glossy object."""
-LEAST_APART, LEAST_GAIN_APART = 20, 0.2
-"""Number of pixels that face otherwise than most (`Fit.apart`) from which on they must agree, and the least part of their cost that goes:
-of balls before glossy planes with right lights, none goes, while .4 to .8 of the cost of all pixels does."""
+LEAST_GAIN_APART = 0.2
+"""Least part of the cost of pixels that face otherwise than most (`Fit.apart`) that goes: of balls before glossy planes with right
+lights, none goes, while .4 to .8 of the cost of all pixels does."""
 UNEXPLAINED_APART = "others do not explain what faces otherwise than most of the object"
 TIMES_APART = 1.5
 """Most that they may leave of pixels that face otherwise than most, over what they leave of all: 1.1 on ten objects under wrong lights,
