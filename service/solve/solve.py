@@ -158,7 +158,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
     above = _count_above_one(solution, solved)
     if above > MANY_ABOVE_ONE * solved.sum() and method is not Method.REFERENCE:
-        solution.warnings.append(_above_one(above / solved.sum(), capture))
+        solution.warnings.append(_above_one(above / solved.sum(), capture, shining=solution.specular is None))
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
     elif not counts[Status.OK.name.lower()]:
@@ -287,10 +287,12 @@ def _count_above_one(solution: Solution, solved: np.ndarray) -> int:
     return int((least[:, pixels] > 1).any(axis=0).sum())
 
 
-def _above_one(part: float, capture: Capture) -> str:
+def _above_one(part: float, capture: Capture, *, shining: bool) -> str:
+    """Return the sentence of an albedo above 1 on this part of the pixels; `shining`: whether the method takes highlights for albedo."""
     relative = capture.manifest.irradiance_scale == "relative"
     return (f"diffuse_albedo: is above 1 at {100 * part:.0f} % of the solved pixels, which no texture holds: " + (
         "leave --albedo-scale out, or give a smaller one" if relative else
+        ("metal or highlights count as matt there (--method svbrdf tells them), or " if shining else "") +
         "frames[].light are too weak by a factor; declare irradiance_scale relative if it is not known"))
 
 
