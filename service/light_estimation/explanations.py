@@ -13,6 +13,7 @@ import numpy as np
 from service.light_estimation.grey_ball import ENCODINGS, other_readings
 from service.light_estimation.lambertian import (
     LEAST_APART,
+    PLANE,
     SHADOW,
     Fit,
     bright_readings,
@@ -256,11 +257,12 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     free, misfit = misfits(lit)
     if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
         return None
-    apart = unlike_most(lights @ surface)
-    if apart.sum() >= LEAST_APART:
-        explained, declared = misfits(lit & apart)
-        if declared < TIMES_FREE * explained:
-            return None
+    apart = unlike_most(lights @ surface, PLANE, 3)  # any readings of three planes are explained by three numbers of each light
+    if apart.sum() < LEAST_APART:
+        return None
+    explained, declared = misfits(lit & apart)
+    if declared < TIMES_FREE * explained:
+        return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
 

@@ -30,8 +30,9 @@ LEAST_TOWARDS = 0.4
 most pixels."""
 LEAST_PIXELS = 20
 """Least number of these pixels that must see a light for it to be judged."""
-ALIKE, APART = np.cos(np.radians(10)), np.cos(np.radians(15))
-"""Cosines of the angles within which normals, or patterns of readings, count as one, and beyond which they are others."""
+SIDE, PLANE = (10.0, 15.0), (3.0, 5.0)
+"""Degrees within which normals, or patterns of readings, are those of one side of an object, and beyond which those of another; and of one
+plane and another."""
 LEAST_APART = 20
 """Number of pixels that face otherwise than most from which on they must agree with what explains the others."""
 SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
@@ -40,7 +41,10 @@ lights."""
 
 FACING, FACING_INSTEAD = 0.8, 0.83
 """Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes: 0.85 of objects
-with metal parts. Bare metal, whose Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
+with metal parts. Bare metal, whose Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction;
+beside metal, what fits Lambert's law faces the camera."""
+FITS = 0.1
+"""Robust standard deviation of the residuals of a pixel that fits Lambert's law, relative to |b|: metal leaves 0.13 and more."""
 
 
 class ViewAxis(NamedTuple):
@@ -72,7 +76,8 @@ class Fit(NamedTuple):
     @property
     def towards_camera(self) -> ViewAxis | None:
         """The axis along which visible surfaces face where it is not z, as where directions are negated or axes exchanged; else None."""
-        if self.facing >= FACING:
+        fitting = self.vector[2, self.spare & (MAD_TO_SIGMA * median_of(np.abs(self.residual), self.lit) < FITS)]
+        if self.facing >= FACING or (len(fitting) >= LEAST_APART and (fitting > 0).mean() >= FACING_INSTEAD):
             return None
         found = max((ViewAxis(axis, sign, float((sign * self.vector[axis] > 0).mean())) for axis in (2, 1, 0) for sign in (1, -1)),
                     key=lambda each: each.share)
@@ -86,7 +91,7 @@ class Fit(NamedTuple):
     @property
     def apart(self) -> np.ndarray:
         """Return whether each pixel faces otherwise than most, [pixels] bool."""
-        return unlike_most(self.vector)
+        return unlike_most(self.vector, SIDE)
 
     def misfit(self, pixels: np.ndarray | bool = True) -> float:
         """Return the robust standard deviation of the residuals of pixels [pixels] with readings to spare; NaN without any."""
@@ -94,12 +99,18 @@ class Fit(NamedTuple):
         return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
 
 
-def unlike_most(vectors: np.ndarray) -> np.ndarray:
-    """Return which of some vectors [n, pixels], normals or patterns of readings, are not as most are, [pixels] bool. Highlights of a plane
-    look like other lights to all of its pixels: only those that face otherwise tell."""
+def unlike_most(vectors: np.ndarray, degrees: tuple[float, float], count: int = 1) -> np.ndarray:
+    """Return which of some vectors [n, pixels], normals or patterns of readings, are not as those of the `count` largest sides or planes,
+    within and beyond these `degrees`, [pixels] bool. Highlights of a plane look like other lights to all of its pixels: only those that
+    face otherwise tell."""
+    alike, beyond = np.cos(np.radians(degrees))
     unit = vectors / np.maximum(np.linalg.norm(vectors, axis=0), 1e-300)
-    commonest = unit[:, (unit.T @ unit > ALIKE).sum(axis=0).argmax()]
-    return np.asarray(commonest @ unit < APART)
+    cosines = unit.T @ unit
+    apart = np.ones(len(cosines), dtype=bool)
+    for _ in range(count):
+        commonest = (cosines[:, apart] > alike).sum(axis=1).argmax()
+        apart &= cosines[commonest] < beyond
+    return apart
 
 
 def fit_lambertian(

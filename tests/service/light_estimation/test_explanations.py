@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 
 from service.light_estimation.explanations import Sample, better_explanation, fit_manifest
+from service.light_estimation.lambertian import FACING
 from stage.transforms import fibonacci_sphere
 from tests.reference.microfacet import specular, unit
 
 VIEW = np.array([0.0, 0.0, 1.0])
+
+
+def sample_of(readings, lights):
+    """Grey readings [lights, pixels] under lights of irradiance 1."""
+    count = len(lights)
+    return Sample(np.repeat(readings[..., None], 3, axis=2), readings > 0, lights, np.ones((count, 3)), np.ones(count), "lin_rec709_scene")
 
 
 @pytest.mark.parametrize("ball", [60, 100])
@@ -24,6 +31,27 @@ def test_a_ball_before_a_metal_plane_tells_that_lights_are_right(ball, alpha):
     matt = 0.5 / np.pi * np.maximum(lights @ curved.T, 0)
     readings = np.concatenate([metal, matt], axis=1)
     readings *= 1 + 0.01 * draw.normal(size=readings.shape)
-    radiance = np.repeat(readings[..., None], 3, axis=2)
-    sample = Sample(radiance, readings > 0, lights, np.ones((16, 3)), np.ones(16), "lin_rec709_scene")
+    sample = sample_of(readings, lights)
     assert better_explanation(sample, fit_manifest(sample)) is None
+
+
+@pytest.mark.parametrize("alpha", [0.3, 1.0])
+def test_three_planes_tell_no_directions(alpha):
+    """Three numbers of each light explain any readings of three planes, as of a box of metal under right lights."""
+    lights = fibonacci_sphere(60)
+    lights = lights[lights[:, 2] > 0.4]
+    faces = unit(np.array([[0.6, 0.1, 1.0], [-0.5, 0.5, 1.0], [-0.1, -0.8, 1.0]]))
+    sample = sample_of(np.stack([specular(np.repeat(faces, 200, axis=0), light, VIEW, alpha, 0.9) for light in lights]), lights)
+    assert better_explanation(sample, fit_manifest(sample)) is None
+
+
+def test_what_fits_beside_metal_tells_that_axes_are_right():
+    """Normals that face away are those of metal, and no sign of exchanged axes, where what fits Lambert's law faces the camera."""
+    draw = np.random.default_rng(5)
+    lights = fibonacci_sphere(240)
+    lights = lights[lights[:, 2] > 0.4]
+    matt = np.maximum(lights @ unit(draw.normal(size=(150, 3)) * [0.5, 0.5, 0] + [0, 0, 1]).T, 0)
+    away = lights @ unit(np.array([-1.0, 0.0, -0.3]) + 0.1 * draw.normal(size=(450, 3))).T
+    metal = np.where(away > 0, away * np.exp(0.6 * draw.normal(size=away.shape)), 0)
+    fit = fit_manifest(sample_of(np.concatenate([matt, metal], axis=1), lights))
+    assert fit.facing < FACING and fit.towards_camera is None
