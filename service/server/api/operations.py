@@ -142,12 +142,10 @@ def get_audit(service: ServiceDep, caller: Admin, limit: Annotated[int, Query(ge
 
 def _end_worker(service: Service, caller: Caller, worker: str, what: str) -> WorkerView:
     found = next((each for each in _workers(service, caller) if each.id == worker), None)
-    if found is None:
-        raise ApiError("not-found", f"there is no worker {worker}")
-    if found.busy and found.job is None:
+    if found is not None and found.busy and found.job is None:
         raise ApiError("conflict", f"{worker} does a job of another project")
-    if not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:],
-                          partial(workers.ask, worker=worker, what=what)):
+    ask = partial(workers.ask, worker=worker, what=what)
+    if found is None or not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:], ask):
         raise ApiError("not-found", f"there is no worker {worker}")
     return found.model_copy(update={"asked": what})
 

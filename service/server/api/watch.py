@@ -8,7 +8,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from service.requests.answers import JobView
-from service.requests.base.identifiers import JOB, KEY
+from service.requests.base.identifiers import JOB
 from service.requests.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.base.log import logger
@@ -145,12 +145,10 @@ class Watcher:
         """End the streams of keys and tokens that were revoked or have expired; unless `now`, look at the keys every KEYS_S only."""
         if not now and time.monotonic() < self._keys_until:
             return
-        used = {listener.caller.key or "" for listener in self._all() if listener.caller is not None
-                and (listener.caller.key or "").startswith(f"{KEY}_")}
-        valid = await asyncio.to_thread(keys.still_valid, self._database, used) if used else set[str]()
+        callers = {listener.caller for listener in self._all() if listener.caller is not None}
+        gone = await asyncio.to_thread(keys.no_longer_valid, self._database, callers)
         for listener in self._all():
-            caller = listener.caller
-            if caller is not None and (caller.key in used - valid or (caller.until is not None and caller.until < time.time())):
+            if listener.caller in gone:
                 listener.close()
         self._keys_until = time.monotonic() + KEYS_S
 

@@ -8,15 +8,11 @@ Alembic is imported only to make or upgrade tables: its import takes a tenth of 
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import sqlalchemy as sa
 
 from service.server.database import audit, tables
 from service.server.database.engine import Database, DatabaseError
-
-if TYPE_CHECKING:
-    from alembic.config import Config
 
 REVISIONS = "relit_schema"
 """Table in which Alembic keeps the revision of the database."""
@@ -36,8 +32,10 @@ def upgrade(database: Database) -> None:
         if found == _newest():
             return
         from alembic import command
+        from alembic.config import Config
 
-        config = _alembic(connection)
+        config = Config(attributes={"connection": connection})
+        config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
         if found is None and not _has_tables(connection):
             tables.metadata.create_all(connection)
             command.stamp(config, "head")
@@ -91,11 +89,3 @@ def _require_known(found: str | None) -> None:
     if found not in _known():
         raise DatabaseError(f"the database has the tables of a newer relit (revision {found}): "
                             "use that program, or another data folder or database")
-
-
-def _alembic(connection: sa.Connection) -> "Config":
-    from alembic.config import Config
-
-    config = Config(attributes={"connection": connection})
-    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    return config

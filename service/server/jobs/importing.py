@@ -18,7 +18,7 @@ from service.requests.base.identifiers import UPLOAD, new_id
 from service.requests.states import CHECKING
 from service.server.base.safe_names import folded
 from service.server.database import intakes, quotas, uploads
-from service.server.jobs.places import StepFiles
+from service.server.jobs.context import StepFiles
 from service.server.storage import layout
 from stage.capture.manifest import FILE_NAME
 from stage.errors import storage

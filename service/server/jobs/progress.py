@@ -85,11 +85,11 @@ class JobProgress:
             counted = self._counted
             rate = counted / spent if counted and spent > 0 else None
             made = self._offset + counted
-            progress = jobs.StageProgress(self._stage, max(made, self._shown) if self._stage == FRAMES else made, self._total, rate)
+            shown = max(made, self._shown) if self._stage == FRAMES else made
             try:
-                self._stopped = not jobs.advance(self._database, self._claim, progress, frames=made, repeating=self._repeating,
-                                                 begun=self._begun if self._new_stage else None,
-                                                 entered=self._stage != self._logged)
+                self._stopped = not jobs.advance(
+                    self._database, self._claim, self._stage, shown, self._total, rate, frames=made, repeating=self._repeating,
+                    begun=self._begun if self._new_stage else None, entered=self._stage != self._logged)
                 self._logged = self._stage
                 self._record_at = time.monotonic() + EVERY_S
                 self._new_stage = False

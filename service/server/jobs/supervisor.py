@@ -67,7 +67,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
 class _Slot:
     device: str
     process: SpawnProcess | None = None
-    heartbeat: Heartbeat | None = None
+    heartbeat: Heartbeat = field(default_factory=Heartbeat)
     failures: int = 0
     """Starts in a row after which the worker died before it was ready."""
     start_at: float = field(default_factory=time.monotonic)
@@ -120,13 +120,12 @@ class Supervisor:
         now = time.monotonic()
         if slot.process is None:
             if now >= slot.start_at:
-                heartbeat = Heartbeat()
-                process = self._spawn.Process(target=run_worker, args=(self._settings, slot.device, heartbeat),
+                slot.heartbeat = Heartbeat()
+                process = self._spawn.Process(target=run_worker, args=(self._settings, slot.device, slot.heartbeat),
                                               name=f"relit-worker-{slot.device}")
                 process.start()
-                slot.process, slot.heartbeat = process, heartbeat
+                slot.process = process
             return
-        assert slot.heartbeat is not None, "it has been started"
         if not slot.process.is_alive():
             slot.failures = 0 if slot.heartbeat.was_ready else slot.failures + 1
             pause = PAUSES_S[min(slot.failures, len(PAUSES_S) - 1)]

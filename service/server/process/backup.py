@@ -36,7 +36,7 @@ from service.server.storage import layout
 from service.server.storage.bucket import Bucket, Object
 from service.server.storage.folder import REMOVED, is_shown
 from service.server.storage.objects import TRANSFERS
-from service.server.storage.part_files import part_files_folder
+from service.server.storage.upload_parts import part_files_folder
 from stage.errors import StorageError, storage
 from stage.files import write_text
 

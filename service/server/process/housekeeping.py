@@ -19,7 +19,7 @@ from service.server.database import audit, hooks, idempotency, intakes, jobs, wo
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.tables import clock as clock_table
 from service.server.jobs.queue import JobQueue
-from service.server.jobs.worker_lock import FileWorkerLock
+from service.server.jobs.takeover import FileWorkerLock
 from service.server.storage import layout
 from service.server.storage.folder import drop_folder
 from service.server.storage.objects import Storage

@@ -1,6 +1,7 @@
 """What the service clears away by itself, and what it leaves alone; days pass by an injected clock."""
 
 import os
+from contextlib import closing
 
 import sqlalchemy as sa
 
@@ -10,7 +11,7 @@ from service.server.database import audit, idempotency, intakes, jobs, tables, u
 from service.server.process import housekeeping
 from service.server.process.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, part_files_folder
+from service.server.storage.upload_parts import open_upload_parts, part_files_folder
 from tests.service.server.process.house import DAYS, PROJECT, House
 from tests.service.waiting import until
 
@@ -60,18 +61,19 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 
 def test_uploads_that_nobody_goes_on_with_expire(house):
     capture, folder = house.capture(), part_files_folder(house.settings)
+    parts = open_upload_parts(house.settings, house.database, house.storage)
     upload, done = new_id(UPLOAD), new_id(UPLOAD)
     for identifier in (upload, done):
         house.database.transact(lambda connection, identifier=identifier: uploads.insert(
             connection, identifier=identifier, project=PROJECT, intake=capture, path=identifier, length=10, sha256=None))
     assert uploads.finish(house.database, done, 10)
-    with PartFile.open(folder, upload) as part:
+    with closing(parts.open({"id": upload})) as part:
         part.append([b"12345"])
-    PartFile.open(folder, "up_orphan").close()
+    parts.open({"id": "up_orphan"}).close()
     house.round(47 * HOUR_S)
     assert uploads.find(house.database, upload, PROJECT) and {path.stem for path in folder.iterdir()} == {upload, "up_orphan"}
     house.now += 2 * HOUR_S
-    with PartFile.open(folder, upload):  # a request adds to it
+    with closing(parts.open({"id": upload})):  # a request adds to it
         house.round()
         assert uploads.find(house.database, upload, PROJECT)
     house.round()
