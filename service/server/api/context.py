@@ -68,19 +68,29 @@ ServiceDep = Annotated[Service, Depends(service_of)]
 bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `relit keys create`.")
 
 
-def authenticate(request: Request) -> Caller:
-    """Return who sent the request; a second call of the same request returns the same."""
+async def authenticated(request: Request) -> Caller:
+    """Return who sent the request; a key that asks too often costs neither thread nor query, and a second call nothing."""
     known: Caller | None = getattr(request.state, "caller", None)
     if known is not None:
         return known
     service: Service = request.app.state.service
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
+    key = given if scheme.lower() == "bearer" else ""
+    service.limiter.require(key.partition(".")[0])
+    caller = await run_in_threadpool(_sender_of, request, service, key)
+    service.running.enter(caller.key)
+    request.state.running = True  # middleware.RequestLog ends it
+    return caller
+
+
+def _sender_of(request: Request, service: Service, key: str) -> Caller:
+    """Return who sent a request with a key or a token; empty: without one."""
     caller: Caller | str | None = None
-    if scheme.lower() == "bearer" and given:
-        if service.tokens is not None and given.count(".") == 2:  # a JWT; keys have one dot
-            caller = service.tokens.caller(given, request.headers.get(PROJECT_HEADER))
+    if key:
+        if service.tokens is not None and key.count(".") == 2:  # a JWT; keys have one dot
+            caller = service.tokens.caller(key, request.headers.get(PROJECT_HEADER))
         else:
-            caller = keys.find(service.database, given)
+            caller = keys.find(service.database, key)
     elif service.settings.anonymous:
         require_local(request)
         caller = ANONYMOUS
@@ -89,19 +99,6 @@ def authenticate(request: Request) -> Caller:
         raise ApiError("unauthenticated", fault, headers={"WWW-Authenticate": "Bearer"})
     request.state.caller = caller  # for the log, too
     service.limiter.take(caller.key)
-    return caller
-
-
-async def authenticated(request: Request) -> Caller:
-    """Return who sent the request, as `authenticate` does in another thread; a key that asks too often costs neither thread nor query."""
-    service: Service = request.app.state.service
-    scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
-    if getattr(request.state, "caller", None) is None and scheme.lower() == "bearer":
-        service.limiter.require(given.partition(".")[0])
-    caller = await run_in_threadpool(authenticate, request)
-    if not getattr(request.state, "running", False):
-        service.running.enter(caller.key)
-        request.state.running = True  # middleware.RequestLog ends it
     return caller
 
 

@@ -254,6 +254,6 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Fi
         return identifier
 
     asked = [prefix, name, None if folder is None else str(folder)]
-    identifier, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+    identifier = idempotency.create_once(service.database, caller.project, token, asked, make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
     return _view(service, caller, identifier)

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 
 from service.requests.answers import AuditEntry, AuditPage, DiskView, JobView, MachinesView, ProjectView, WorkerView
 from service.requests.keys import Scope
 from service.server.api.context import Admin, Reader, Service, ServiceDep, authenticated, bearer, has_space, require_local
-from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import audit, jobs, workers
 from service.server.database.engine import UNANSWERED
@@ -100,7 +100,7 @@ async def operator_of(service: ServiceDep, request: Request,
     response_class=Response, summary="Metrics for Prometheus", openapi_extra={"security": [{}]})
 def get_metrics(request: Request) -> Response:
     """Return requests, jobs by state, workers by device and more. A service that listens beyond this machine needs a key of scope admin."""
-    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)
+    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
 
 @router.get("/v1/project", responses=responses(401, 403, 422, 429, 503), summary="See the project of the key")

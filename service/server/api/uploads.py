@@ -172,11 +172,11 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+    upload = idempotency.create_once(service.database, caller.project, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
     if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
-        upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+        upload = idempotency.create_once(service.database, caller.project, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")

@@ -23,10 +23,11 @@ ORDER = list(Scope)
 DAY_S = 86_400.0
 USED_S = 60.0
 """Seconds to which the last use of a key is recorded, so that not every request writes."""
-VALID = sa.and_(keys.c.revoked_at.is_(None), sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
 FOUND = sa.select(keys).where(keys.c.id == sa.bindparam("key"))
-STILL_VALID = sa.select(keys.c.id).where(keys.c.id.in_(sa.bindparam("keys", expanding=True)), VALID)
-"""Conditions and queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
+STILL_VALID = sa.select(keys.c.id).where(
+    keys.c.id.in_(sa.bindparam("keys", expanding=True)), keys.c.revoked_at.is_(None),
+    sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
+"""Queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
 and those of each request would wait for the garbage collector."""
 
 

@@ -29,7 +29,7 @@ def upgrade(database: Database) -> None:
         else:
             connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": UPGRADE_LOCK})
         found = _revision(connection)
-        if found == _newest():
+        if found == _known()[-1]:
             return
         from alembic import command
         from alembic.config import Config
@@ -48,7 +48,7 @@ def upgrade(database: Database) -> None:
 def is_current(database: Database) -> bool:
     """Return whether the tables are those of this program; nothing is changed."""
     with database.engine.connect() as connection:
-        return _revision(connection) == _newest()
+        return _revision(connection) == _known()[-1]
 
 
 def require_current(database: Database) -> None:
@@ -57,7 +57,7 @@ def require_current(database: Database) -> None:
         if not _has_tables(connection):
             raise DatabaseError("the database has no tables of relit: relit serve makes them")
         found = _revision(connection)
-    if found != _newest():
+    if found != _known()[-1]:
         _require_known(found)
         raise DatabaseError("the database has the tables of an older relit: relit serve of this version upgrades them")
 
@@ -76,10 +76,6 @@ def _revision(connection: sa.Connection) -> str | None:
 def _known() -> list[str]:
     """Return the revisions that this program knows, by the names of their files, oldest first."""
     return sorted(file.name[1:].partition("_")[0] for file in (MIGRATIONS / "versions").glob("r*.py"))
-
-
-def _newest() -> str:
-    return _known()[-1]
 
 
 def _require_known(found: str | None) -> None:

@@ -94,11 +94,6 @@ class StepFiles(NamedTuple):
     context: WorkerContext
     progress: Progress
 
-    @property
-    def device(self) -> str:
-        """Name of the device to compute on."""
-        return self.context.device
-
     def cache(self, capture: str) -> Path:
         """Return the folder of the image stack of a capture."""
         return self.context.settings.cache / capture
@@ -110,7 +105,7 @@ class StepFiles(NamedTuple):
             if name in model.model_fields and name not in JobRequest.model_fields and name not in values:
                 values[name] = self._place(name, getattr(job, name), values.get("capture"))
         capture = next(iter(getattr(job, "captures", ())), getattr(job, "capture", None))
-        ours = {"device": self.device, "cache": None if capture is None else self.cache(capture)}
+        ours = {"device": self.context.device, "cache": None if capture is None else self.cache(capture)}
         return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
 
     def _place(self, field: str, value: Any, capture: Path | None) -> Any:

@@ -123,5 +123,3 @@ def _made(folder: Path, given: frozenset[str]) -> dict[str, int]:
             raise RequestError(f"{name}: is named by the files, and was not uploaded with them")
         made[name] = found.st_size
     return made
-
-

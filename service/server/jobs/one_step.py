@@ -84,7 +84,7 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
     kind = BasisKind(request.options.basis)
     options = {name: value for name, value in dict(request.options).items() if name != "basis"}
     make_basis(BasisRequest(capture=files.intake(request.capture), out=files.out / f"{BASIS}{SUFFIXES[kind]}", kind=kind,
-                            device=files.device, cache=files.cache(request.capture), **options), files.progress)
+                            device=files.context.device, cache=files.cache(request.capture), **options), files.progress)
 
 
 def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
@@ -113,7 +113,7 @@ def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles
 
     folder = files.intake(request.capture)
     sweep = file_within(folder, request.sweep, "sweep")
-    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.device), files.progress,
+    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.context.device), files.progress,
                   allowed=time_steps(folder))
 
 

@@ -76,15 +76,12 @@ class JobProgress:
             if self._stopped:
                 raise Stopped
             self._counted = 0 if self._opening else done
-            now = time.monotonic()
-            further = self._stage == FRAMES and self._reached is not None and self._offset + self._counted > self._reached
+            made, now = self._offset + self._counted, time.monotonic()
+            further = self._stage == FRAMES and self._reached is not None and made > self._reached
             if now < self._record_at and not further:
                 return
             self.guard()
-            spent = now - self._began
-            counted = self._counted
-            rate = counted / spent if counted and spent > 0 else None
-            made = self._offset + counted
+            rate = self._counted / (now - self._began) if self._counted and now > self._began else None
             shown = max(made, self._shown) if self._stage == FRAMES else made
             try:
                 self._stopped = not jobs.advance(

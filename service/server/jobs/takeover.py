@@ -7,11 +7,11 @@ holds that one's lock meanwhile, so that no two take over the same jobs. Names o
 """
 
 import os
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,6 +21,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.requests.states import QUEUED
 from service.server.base import file_lock
 from service.server.base.log import logger
+from service.server.base.rounds import Rounds
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import Claim
@@ -154,7 +155,7 @@ def open_worker_lock(database: Database, locks: Path, worker: str) -> WorkerLock
     return FileWorkerLock(locks, worker) if database.is_sqlite else AdvisoryWorkerLock(database, worker)
 
 
-class Takeover:
+class Takeover(Rounds):
     """A thread that keeps the worker's own lock and takes over from workers that died."""
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
@@ -167,23 +168,13 @@ class Takeover:
         `asked` is called with what an operator asks of this worker, each round.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
-        self._every_s, self._max_lost = every_s, max_lost
+        super().__init__("relit-takeover", every_s, self._guarded_round)
+        self._max_lost = max_lost
         self._running, self._beat, self._lock_lost, self._asked = running, beat, lock_lost, asked
         self.state = workers.READY
         """State of this worker for the table of workers."""
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relit-takeover", daemon=True)
         self._grace = self._refused = 0
         self._unknown: Counter[str] = Counter()
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread and wait for it."""
-        self._ended.set()
-        self._thread.join()
 
     def round(self) -> None:
         """Renew the lock, then look at the other workers once."""
@@ -207,34 +198,27 @@ class Takeover:
                 if dead:
                     self._take_over(worker)
 
-    def _run(self) -> None:
-        while True:
-            self._beat()
-            try:
-                self.round()
-            except UNANSWERED as error:
-                logger.warning("database does not answer", error=message_of(error))
-            except Exception as error:  # the next round may succeed; a worker without rounds would seem dead
-                logger.error("takeover failed", exc_info=error)
-            if self._ended.wait(self._every_s):
-                return
+    def _guarded_round(self) -> None:
+        self._beat()
+        try:
+            self.round()
+        except UNANSWERED as error:
+            logger.warning("database does not answer", error=message_of(error))
+        except Exception as error:  # the next round may succeed; a worker without rounds would seem dead
+            logger.error("takeover failed", exc_info=error)
 
     def _take_over(self, worker: str) -> None:
+        """Queue the workflows of a dead worker again, or end those of its jobs that have lost too many workers."""
         workflows = self._queue.taken_by().get(worker, [])  # read again under the worker's lock: another may have been faster
         if workflows:
             logger.warning("worker died", dead=worker, jobs=[job_and_attempt(workflow)[0] for workflow in workflows])
         for workflow in workflows:
-            self._take(workflow, worker)
+            record = partial(jobs.record_lost_worker, claim=Claim(*job_and_attempt(workflow), worker), limit=self._max_lost)
+            if not is_help(workflow) and self._database.transact(record) == QUEUED:
+                self._queue.requeue(workflow)
+            else:  # also of help, as the worker that has the job does what is left
+                self._queue.cancel(workflow)
         workers.remove(self._database, worker)
-
-    def _take(self, workflow: str, worker: str) -> None:
-        """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
-        claim = Claim(*job_and_attempt(workflow), worker)
-        if not is_help(workflow) and self._database.transact(
-                lambda connection: jobs.record_lost_worker(connection, claim, self._max_lost)) == QUEUED:
-            self._queue.requeue(workflow)
-        else:  # also of help, as the worker that has the job does what is left
-            self._queue.cancel(workflow)
 
     def _return_forgotten(self, workflows: list[str]) -> None:
         unknown = set(workflows) - self._running()

@@ -101,12 +101,6 @@ class Backup(NamedTuple):
     """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
 
 
-class _Contents(NamedTuple):
-    files: dict[str, dict[str, Any]]
-    storage: dict[str, Any] | None
-    """The store of a service with storage_url: its URL, whether the objects are copied, and the objects; None without storage_url."""
-
-
 def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
     """Copy a service, which may run meanwhile, to a new folder; objects of `storage_url` are named unless `copy_objects` is set."""
     if settings.is_sqlite and not settings.sqlite_file.exists():
@@ -244,12 +238,13 @@ def _postgres(settings: Settings, program: str, *arguments: str) -> None:
         raise RequestError(f"{program}: {' '.join(done.stderr.split())[:500]}")
 
 
-def _contents(folder: Path) -> _Contents:
+def _contents(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
+    """Return the files of a backup, and of the store of a service with storage_url its URL, its objects and whether these are copied."""
     path = folder / CONTENTS
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         files, stored = found["files"], found.get("storage")
-        assert found["schema"] == SCHEMA
+        assert found["schema"] == SCHEMA and isinstance(files, dict)
         if stored is not None:
             assert isinstance(stored["url"], str)
             copied = {f"{OBJECTS}/{path}" for path, entry in stored["objects"].items() if isinstance(entry["version"], str)}
@@ -261,7 +256,7 @@ def _contents(folder: Path) -> _Contents:
     for name in files:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise RequestError(f"{path}: {name} leads out of the backup")
-    return _Contents(dict(files), stored)
+    return files, stored
 
 
 def _files(folder: Path) -> Iterator[Path]:

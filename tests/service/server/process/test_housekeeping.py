@@ -89,7 +89,7 @@ def test_tokens_are_remembered_for_a_day_and_lines_of_the_audit_log_for_audit_da
         return made[-1]
 
     def ask() -> str:
-        return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)[0]
+        return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)
 
     ask()
     house.round(0.9 * DAY_S)
@@ -201,14 +201,14 @@ def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypa
     """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
     bad, good = house.job(), house.job()
     house.now += 2 * DAYS * DAY_S
-    forget = housekeeping._forget
+    remove = jobs.remove
 
     def fail(connection, job):
         if job == bad:
             raise ValueError("no such character")
-        return forget(connection, job)
+        return remove(connection, job)
 
-    monkeypatch.setattr(housekeeping, "_forget", fail)
+    monkeypatch.setattr(jobs, "remove", fail)
     logged = []
     monkeypatch.setattr(housekeeping.logger, "error", lambda event, **fields: logged.append((event, fields["piece"])))
     stale = house.cache(new_id(CAPTURE))
