@@ -23,7 +23,7 @@ test: $(VENV)/installed-dev
 
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
 # and the kernels and products as on a GPU, on an emulated one, which takes what the others, who often wait, leave of the processors;
-# PART=2 takes of the long tests those of the third part of ten alone, and of those on the emulated device those of the third part of three
+# PART=2 takes of the long tests those of the third part of twenty alone, and of those on the emulated device those of the third part of six
 test-all: $(VENV)/installed-dev
 	$(EMULATED) $(if $(PART),--part=$(PART)) >$(VENV)/emulated.log 2>&1 & emulated=$$!; \
 	  $(PYTEST) --durations=60 $(if $(PART),--part=$(PART)); tests=$$?; \

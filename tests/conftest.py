@@ -18,7 +18,7 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, lambda *_: None)
 
 
-LONG_PARTS, EMULATED_PARTS = 10, 3
+LONG_PARTS, EMULATED_PARTS = 20, 6
 """What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all take an hour."""
 
 
@@ -93,7 +93,7 @@ def is_long(item: pytest.Item) -> bool:
 
 
 def left_out(items: list[pytest.Item], part: int) -> list[pytest.Item]:
-    """Return the long tests of all files but every tenth, beginning with the file of this number modulo ten."""
+    """Return the long tests of all files but every twentieth, beginning with the file of this number modulo twenty."""
     files = sorted({item.path for item in items if is_long(item)})
     chosen = set(files[part % LONG_PARTS::LONG_PARTS])
     return [item for item in items if is_long(item) and item.path not in chosen]

@@ -41,6 +41,8 @@ MANY_AMBIGUOUS = 0.25
 """Part of the solved pixels with an ambiguous normal from which it is said."""
 MANY_ABOVE_ONE = 0.01
 """Part of the solved pixels with an albedo above 1 from which it is said: noise and highlights reach that at less."""
+SURELY_ABOVE = 2.0
+"""Standard errors of the albedo: metal whose normals are hardly known has any albedo."""
 
 
 class SolveResult(NamedTuple):
@@ -154,7 +156,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     status = solution.status.reshape(mask.shape)
     solved = np.isin(status, SOLVED)
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
-    above = 0 if solution.albedo is None else int((solution.albedo.reshape(3, *mask.shape)[:, solved] > 1).any(axis=0).sum())
+    above = _count_above_one(solution, solved)
     if above > MANY_ABOVE_ONE * solved.sum() and method is not Method.REFERENCE:
         solution.warnings.append(_above_one(above / solved.sum(), capture))
     if not solved.any():
@@ -273,6 +275,16 @@ def _nothing_solved(counts: Mapping[str, int]) -> str:
     keep = ("; --max-sigma 180 keeps unsure normals" if common == Status.UNSURE.name.lower() else
             "; check the lights, the exposure and the mask")
     return f"no pixel is solved: {share:.0f} % of the mask have the status {common}, and the layer status says why for every pixel{keep}"
+
+
+def _count_above_one(solution: Solution, solved: np.ndarray) -> int:
+    """Return the number of solved pixels whose albedo is above 1 by more than SURELY_ABOVE of its standard errors."""
+    if solution.albedo is None:
+        return 0
+    least, sigma, pixels = solution.albedo, solution.albedo_sigma(), solved.reshape(-1)
+    if sigma is not None:
+        least = least - np.float32(SURELY_ABOVE) * sigma
+    return int((least[:, pixels] > 1).any(axis=0).sum())
 
 
 def _above_one(part: float, capture: Capture) -> str:

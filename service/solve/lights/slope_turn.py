@@ -99,6 +99,8 @@ def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: N
         if np.abs(fit.changes[:3]).max() < SETTLED:
             break
     assert given is not None and fit is not None  # the former asks for less
+    if (np.abs(fit.changes[:3]) > np.sqrt(np.diag(fit.covariance))).any():
+        return None  # the last step does not end near the one before: turns about the axis of cylinders are told by their errors alone
     vector = right.as_rotvec()
     less = np.log1p((given.left / (OUTLIER * given.scale))**2) - np.log1p((fit.left / (OUTLIER * given.scale))**2)
     sure = np.diag(fit.covariance).max() < LARGEST_SIGMA**2 and np.nansum(less) > LEAST_LESS * np.sqrt(np.nansum(less**2))
