@@ -19,10 +19,8 @@ from service.requests.imports.patterns import (
     GrayImport,
     LaserImport,
     OpencvGrayImport,
-    PatternImageOptions,
     PhaseImport,
     PhaseShift,
-    RigOptions,
     ScannerImport,
     StereoImport,
     WaveOrigin,
@@ -109,7 +107,7 @@ def _gray(request: GrayImport) -> Imported:
 
     gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
                      row_bits=request.row_bits)
-    pictures = _pattern_images(request, request, request)
+    pictures = _pattern_images(request)
     return import_gray(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, gray=gray)
 
 
@@ -120,7 +118,7 @@ def _phase(request: PhaseImport) -> Imported:
     phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
                        order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
     gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
-    pictures = _pattern_images(request, request, request)
+    pictures = _pattern_images(request)
     return import_phase(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, phase=phase,
                         gray_images=request.gray_images, gray_stripe_px=request.gray_stripe, gray=gray,
                         from_centre=request.origin is WaveOrigin.CENTRE)
@@ -175,24 +173,23 @@ def _axes(axis: PatternAxis) -> tuple[str, ...]:
     return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
 
 
-def _pattern_images(images: PatternImageOptions, rig: RigOptions, given: ImportRequest) -> "PatternImages":
+def _pattern_images(request: GrayImport | PhaseImport) -> "PatternImages":
     """Return which images are frames; those of a video are unpacked first."""
-    from stage.errors import ManifestError
     from stage.importers.patterns import PatternImages
-    from stage.importers.video import FrameRange, is_video, unpack
+    from stage.importers.video import FrameRange, unpack
 
-    video, space = None, images.color_space
-    if is_video(given.source):
-        if given.destination is None:
-            raise ManifestError(f"{given.source}: is a video: give a folder for its frames behind it")
-        video = unpack(given.source, given.destination, FrameRange.parse(images.video_frames or "0"))
-        if "color_space" not in images.model_fields_set:
+    video, space = None, request.color_space
+    if is_video(request.source):
+        if request.destination is None:
+            raise ManifestError(f"{request.source}: is a video: give a folder for its frames behind it")
+        video = unpack(request.source, request.destination, FrameRange.parse(request.video_frames or "0"))
+        if "color_space" not in request.model_fields_set:
             space = "srgb_texture"  # videos are encoded for displays
-    elif images.video_frames is not None:
-        raise ManifestError(f"--video-frames {images.video_frames}: {given.source} is no video")
-    return PatternImages(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
-                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=space, video=video, exposures_s=images.exposures_s,
-                         patterns_first=images.exposure_order is ExposureOrder.PATTERN)
+    elif request.video_frames is not None:
+        raise ManifestError(f"--video-frames {request.video_frames}: {request.source} is no video")
+    return PatternImages(projector=request.projector, images=request.images, mask=request.mask, white=request.white, black=request.black,
+                         calibration=request.calibration, unit_m=request.unit_m, color_space=space, video=video,
+                         exposures_s=request.exposures_s, patterns_first=request.exposure_order is ExposureOrder.PATTERN)
 
 
 def _view(request: LensOptions) -> "View":

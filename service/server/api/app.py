@@ -29,9 +29,13 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                set_routes: Routes | None = None) -> FastAPI:
     """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams, by
     `set_routes` captures are taken at this machine."""
+    # one span for each request; FastAPI makes no metrics and no log, since the service has its own
+    telemetry: TelemetryConfig = {
+        "tracer_provider": tracing, "tracing": tracing is not None, "operation_spans": False, "metrics": False, "logs": False,
+        "auto_configure": False, "exclude": lambda scope: scope["path"] in middleware.QUIET}
     app = FastAPI(title="Relit", version=__version__, description=DESCRIPTION, openapi_url="/v1/openapi.json",
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
-                  telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
+                  telemetry=telemetry, generate_unique_id_function=lambda route: route.name)
     closing = threading.Event()
     storage = open_storage(settings)
     app.state.service = Service(
@@ -46,8 +50,8 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     problems.install(app)
     document.install(app)
     for router in (intakes.captures, importing.router, intakes.environments, intakes.samples, results.environments, uploads.router,
-                   uploads.listings,
-                   uploads.options, jobs.router, events.router, results.router, results.pictures, hooks.router, operations.router):
+                   uploads.listings, uploads.options, jobs.router, events.router, results.router, results.pictures, hooks.router,
+                   operations.router):
         app.include_router(router)
     pages.install(app)
     app.state.has_stage = set_routes is not None
@@ -58,9 +62,3 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     app.add_middleware(tus.TusHeaders)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)
     return app
-
-
-def _telemetry(tracing: TracerProvider | None) -> TelemetryConfig:
-    """One span for each request; FastAPI makes no metrics and no log, since the service has its own."""
-    return {"tracer_provider": tracing, "tracing": tracing is not None, "operation_spans": False, "metrics": False, "logs": False,
-            "auto_configure": False, "exclude": lambda scope: scope["path"] in middleware.QUIET}

@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections.abc import Awaitable, Callable
 from typing import Annotated, NamedTuple
 from urllib.parse import urlsplit
@@ -12,7 +11,6 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.security.utils import get_authorization_scheme_param
 from starlette.concurrency import run_in_threadpool
 
-from service.requests.base.identifiers import KEY
 from service.requests.keys import Scope
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.problems import ApiError
@@ -70,41 +68,37 @@ ServiceDep = Annotated[Service, Depends(service_of)]
 bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `relit keys create`.")
 
 
-def authenticate(request: Request) -> Caller:
-    """Return who sent the request; a second call of the same request returns the same."""
+async def authenticated(request: Request) -> Caller:
+    """Return who sent the request; a key that asks too often costs neither thread nor query, and a second call nothing."""
     known: Caller | None = getattr(request.state, "caller", None)
     if known is not None:
         return known
     service: Service = request.app.state.service
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
-    caller, fault = None, "give a key that is valid as Authorization: Bearer KEY"
-    if scheme.lower() == "bearer" and given:
-        if service.tokens is not None and given.count(".") == 2:  # a JWT; keys have one dot
-            caller = service.tokens.caller(given, request.headers.get(PROJECT_HEADER))
-        else:
-            caller = keys.find(service.database, given)
-            if caller is None:
-                fault = f"{keys.fault_of(service.database, given)}: give a key that is valid"
-    elif service.settings.anonymous:
-        require_local(request)
-        caller = ANONYMOUS
-    if caller is None:
-        raise ApiError("unauthenticated", fault, headers={"WWW-Authenticate": "Bearer"})
-    request.state.caller = caller  # for the log, too
-    service.limiter.take(caller.key)
+    key = given if scheme.lower() == "bearer" else ""
+    service.limiter.require(key.partition(".")[0])
+    caller = await run_in_threadpool(_sender_of, request, service, key)
+    service.running.enter(caller.key)
+    request.state.running = True  # middleware.RequestLog ends it
     return caller
 
 
-async def authenticated(request: Request) -> Caller:
-    """Return who sent the request, as `authenticate` does in another thread; a key that asks too often costs neither thread nor query."""
-    service: Service = request.app.state.service
-    scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
-    if getattr(request.state, "caller", None) is None and scheme.lower() == "bearer":
-        service.limiter.require(given.partition(".")[0])
-    caller = await run_in_threadpool(authenticate, request)
-    if not getattr(request.state, "running", False):
-        service.running.enter(caller.key)
-        request.state.running = True  # middleware.RequestLog ends it
+def _sender_of(request: Request, service: Service, key: str) -> Caller:
+    """Return who sent a request with a key or a token; empty: without one."""
+    caller: Caller | str | None = None
+    if key:
+        if service.tokens is not None and key.count(".") == 2:  # a JWT; keys have one dot
+            caller = service.tokens.caller(key, request.headers.get(PROJECT_HEADER))
+        else:
+            caller = keys.find(service.database, key)
+    elif service.settings.anonymous:
+        require_local(request)
+        caller = ANONYMOUS
+    if not isinstance(caller, Caller):
+        fault = "give a key that is valid as Authorization: Bearer KEY" if caller is None else f"{caller}: give a key that is valid"
+        raise ApiError("unauthenticated", fault, headers={"WWW-Authenticate": "Bearer"})
+    request.state.caller = caller  # for the log, too
+    service.limiter.take(caller.key)
     return caller
 
 
@@ -156,8 +150,7 @@ def _name(host: str) -> str:
 
 def require_valid(service: Service, caller: Caller) -> None:
     """Refuse a caller whose key or token was revoked or has expired since the request began."""
-    revoked = (caller.key or "").startswith(f"{KEY}_") and not keys.still_valid(service.database, [str(caller.key)])
-    if revoked or (caller.until is not None and caller.until < time.time()):
+    if keys.no_longer_valid(service.database, [caller]):
         raise ApiError("unauthenticated", "the key was revoked or has expired", headers={"WWW-Authenticate": "Bearer"})
 
 

@@ -81,7 +81,10 @@ def _describe(operation: dict[str, Any]) -> None:
             headers["Location"] = LOCATION
         response["headers"] = headers | response.get("headers", {})
         if status >= 400:
-            response["content"] = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}, "example": _example(status)}}
+            kind = OF_STATUS[status]
+            example = {"type": f"urn:relit:problem:{kind}", "title": KINDS[kind].title, "status": status,
+                       "detail": "One sentence for a person.", "request_id": "0123456789abcdef", "errors": []}
+            response["content"] = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}, "example": example}}
     operation["responses"] = dict(sorted(operation["responses"].items()))
 
 
@@ -90,9 +93,3 @@ def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
     if len(options) != 1:
         return schema
     return {key: value for key, value in schema.items() if key != "anyOf"} | options[0]
-
-
-def _example(status: int) -> dict[str, Any]:
-    kind = OF_STATUS[status]
-    return {"type": f"urn:relit:problem:{kind}", "title": KINDS[kind].title, "status": status, "detail": "One sentence for a person.",
-            "request_id": "0123456789abcdef", "errors": []}

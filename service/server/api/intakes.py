@@ -25,7 +25,7 @@ from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.base.safe_names import shown
-from service.server.database import annotations, audit, idempotency, intakes, jobs, quotas, uploads
+from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from stage.files import resolved
@@ -170,7 +170,7 @@ def register_sample_environment(service: ServiceDep, caller: Writer, response: R
 def list_annotations(service: ServiceDep, caller: Reader, capture: CaptureId) -> AnnotationPage:
     """Return the annotations of a capture as an AnnotationPage (W3C), which `relit publish --annotations` takes as a file."""
     row_of(service, caller, capture)
-    return page_of(capture, annotations.listing(service.database, capture))
+    return page_of(capture, intakes.annotations_of(service.database, capture))
 
 
 @captures.post("/{capture}/annotations", status_code=201, responses=responses(404, 409), summary="Annotate a capture")
@@ -185,9 +185,9 @@ def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, w
         raise ApiError("invalid", f"target: lies outside the image, which has {width}x{height} pixels")
 
     def work(connection: sa.Connection) -> AnnotationView:
-        row = annotations.insert(connection, capture, wanted.model_dump(mode="json"))
+        row = intakes.annotate(connection, capture, wanted.model_dump(mode="json"))
         if row is None:
-            raise ApiError("conflict", f"{capture} has {annotations.MOST} annotations already: delete one first")
+            raise ApiError("conflict", f"{capture} has {intakes.MOST_ANNOTATIONS} annotations already: delete one first")
         audit.record(connection, caller, "annotation.create", row["id"])
         return view_of(capture, row)
 
@@ -201,7 +201,7 @@ def delete_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, a
     """Delete an annotation of a capture."""
     row_of(service, caller, capture)
     if not audit.recorded(service.database, caller, "annotation.delete", annotation,
-                          partial(annotations.remove, capture=capture, identifier=annotation)):
+                          partial(intakes.remove_annotation, capture=capture, identifier=annotation)):
         raise ApiError("not-found", f"there is no {annotation} of {capture}")
 
 
@@ -254,6 +254,6 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Fi
         return identifier
 
     asked = [prefix, name, None if folder is None else str(folder)]
-    identifier, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+    identifier = idempotency.create_once(service.database, caller.project, token, asked, make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
     return _view(service, caller, identifier)

@@ -82,8 +82,8 @@ def create_job(service: ServiceDep, caller: Writer, response: Response, request:
         require_space(service, FOR_WORK)
         inputs = inputs_of(service, caller.project, request)
         spelled = spelled_out(service, caller.project, request)
-        job, _ = idempotency.create_once(service.database, caller.project, token, asked,
-                                         lambda connection: submit(service, caller, spelled, connection, inputs))
+        job = idempotency.create_once(service.database, caller.project, token, asked,
+                                      lambda connection: submit(service, caller, spelled, connection, inputs))
     response.headers["Location"] = f"/v1/jobs/{job}"
     return view(service, caller, job)
 

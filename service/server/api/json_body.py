@@ -51,11 +51,11 @@ def parse(body: bytes) -> Any:
     """Return what a body of JSON says; refuse one that is nested too deeply, has too many fields, or is not UTF-8 text."""
     try:
         found = json.loads(body.decode(), object_pairs_hook=_object)
+        _require_shallow(found)
     except UnicodeDecodeError:
         raise HTTPException(400, "the body is not UTF-8 text") from None
     except RecursionError:
-        raise _too_deep() from None
-    _require_shallow(found)
+        raise HTTPException(422, f"the body is nested more than {MAX_DEPTH} levels deep") from None
     return found
 
 
@@ -66,6 +66,7 @@ def _object(fields: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _require_shallow(found: Any) -> None:
+    """Raise RecursionError, as the reader of JSON does at a greater depth, for what is nested more than MAX_DEPTH levels deep."""
     level = [found]
     for _ in range(MAX_DEPTH):
         level = [inner for outer in level if isinstance(outer, dict | list)
@@ -73,8 +74,4 @@ def _require_shallow(found: Any) -> None:
         if not level:
             return
     if any(isinstance(inner, dict | list) for inner in level):
-        raise _too_deep()
-
-
-def _too_deep() -> HTTPException:
-    return HTTPException(422, f"the body is nested more than {MAX_DEPTH} levels deep")
+        raise RecursionError

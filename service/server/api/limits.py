@@ -39,7 +39,7 @@ class RateLimiter:
             if tokens >= cost:
                 self._buckets[key] = (tokens - cost, now)
                 if len(self._buckets) > FORGET_ABOVE:
-                    self._forget(now)
+                    self._buckets = {key: bucket for key, bucket in self._buckets.items() if self._tokens(key, now) < self._burst}
                 return
         self._refuse(tokens, cost)
 
@@ -55,10 +55,6 @@ class RateLimiter:
     def _refuse(self, tokens: float, cost: int) -> NoReturn:
         wait = math.ceil((cost - tokens) / self._per_second)
         raise ApiError("too-many", f"the key asks more than {self._per_second:g} times a second", headers={"Retry-After": str(wait)})
-
-    def _forget(self, now: float) -> None:
-        self._buckets = {key: (tokens, counted) for key, (tokens, counted) in self._buckets.items()
-                         if tokens + (now - counted) * self._per_second < self._burst}
 
 
 class AtOnce:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from prometheus_client import CollectorRegistry, Gauge, Histogram, Info, disable_created_metrics, generate_latest
 from prometheus_client import Counter as CounterMetric
 from prometheus_client.core import GaugeMetricFamily, Metric
-from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.gc_collector import GCCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
@@ -20,19 +19,17 @@ from service.server.base.settings import Settings
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database
 
-CONTENT_TYPE = CONTENT_TYPE_LATEST
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 OTHER = "other"
 """Label of unknown methods and paths, so that invented names make no new metrics."""
 disable_created_metrics()  # type: ignore[no-untyped-call]  # which would add a time to every metric
-STATES = (*ACTIVE, *ENDED)
 
 
-class Metrics:
-    """The metrics of one API process, and those from the database."""
+class Metrics(Collector):
+    """The metrics of one API process, and those that it collects from the database when they are asked for."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
-        self._registry = CollectorRegistry()
+        self._settings, self._database, self._registry = settings, database, CollectorRegistry()
         ProcessCollector(registry=self._registry)
         GCCollector(registry=self._registry)
         Info("relit", "The program.", registry=self._registry).info({"version": __version__})
@@ -42,7 +39,7 @@ class Metrics:
                                 registry=self._registry)
         self._received = CounterMetric("relit_http_received_bytes", "Bytes of bodies that came, uploads above all.", ("route",),
                                        registry=self._registry)
-        self._registry.register(_DatabaseMetrics(settings, database))
+        self._registry.register(self)
 
     def count(self, scope: Scope, status: int, waited_s: float, received: int) -> None:
         """Count a request that has ended; status 0: without an answer."""
@@ -56,11 +53,6 @@ class Metrics:
     def text(self) -> bytes:
         """Return all metrics in the format of Prometheus."""
         return generate_latest(self._registry)
-
-
-class _DatabaseMetrics(Collector):
-    def __init__(self, settings: Settings, database: Database) -> None:
-        self._settings, self._database = settings, database
 
     def describe(self) -> list[Metric]:
         """Return no metrics, so that registering asks the database nothing."""
@@ -78,7 +70,7 @@ class _DatabaseMetrics(Collector):
             return
         yield GaugeMetricFamily("relit_database_up", "Whether the database answers.", value=1)
         counted = GaugeMetricFamily("relit_jobs", "Jobs that are kept.", labels=("state",))
-        for state in STATES:
+        for state in (*ACTIVE, *ENDED):
             counted.add_metric((state,), states.get(state, 0))
         yield counted
         yield GaugeMetricFamily("relit_queue_age_seconds", "How long the job that waits for longest has waited; 0: none waits.",

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 
 from service.requests.answers import AuditEntry, AuditPage, DiskView, JobView, MachinesView, ProjectView, WorkerView
 from service.requests.keys import Scope
 from service.server.api.context import Admin, Reader, Service, ServiceDep, authenticated, bearer, has_space, require_local
-from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import audit, jobs, workers
 from service.server.database.engine import UNANSWERED
@@ -100,7 +100,7 @@ async def operator_of(service: ServiceDep, request: Request,
     response_class=Response, summary="Metrics for Prometheus", openapi_extra={"security": [{}]})
 def get_metrics(request: Request) -> Response:
     """Return requests, jobs by state, workers by device and more. A service that listens beyond this machine needs a key of scope admin."""
-    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)
+    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
 
 @router.get("/v1/project", responses=responses(401, 403, 422, 429, 503), summary="See the project of the key")
@@ -142,12 +142,10 @@ def get_audit(service: ServiceDep, caller: Admin, limit: Annotated[int, Query(ge
 
 def _end_worker(service: Service, caller: Caller, worker: str, what: str) -> WorkerView:
     found = next((each for each in _workers(service, caller) if each.id == worker), None)
-    if found is None:
-        raise ApiError("not-found", f"there is no worker {worker}")
-    if found.busy and found.job is None:
+    if found is not None and found.busy and found.job is None:
         raise ApiError("conflict", f"{worker} does a job of another project")
-    if not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:],
-                          partial(workers.ask, worker=worker, what=what)):
+    ask = partial(workers.ask, worker=worker, what=what)
+    if found is None or not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:], ask):
         raise ApiError("not-found", f"there is no worker {worker}")
     return found.model_copy(update={"asked": what})
 

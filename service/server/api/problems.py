@@ -94,8 +94,7 @@ class ApiError(Exception):
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the problems that a route may answer with, for the OpenAPI document."""
-    return {status: {"model": Problem, "description": KINDS[OF_STATUS[status]].title,
-                     "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}} for status in statuses}
+    return {status: {"model": Problem, "description": KINDS[OF_STATUS[status]].title} for status in statuses}
 
 
 def install(app: FastAPI) -> None:

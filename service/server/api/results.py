@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from email.utils import formatdate
 from pathlib import Path as FilePath
 from pathlib import PurePosixPath
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import anyio.to_thread
@@ -31,6 +31,7 @@ from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
 from service.server.base.safe_names import NameFault, check_path
 from service.server.storage import layout
+from service.server.storage.folder import OpenFile
 from stage import inputs
 from stage.errors import StageError
 
@@ -59,17 +60,7 @@ Name = Annotated[str, Path(description="As the listing has it.", examples=["maps
 Tags = Annotated[str | None, Header(description="Entity tags, or *.")]
 
 
-class Opened(NamedTuple):
-    """An open file."""
-
-    name: str
-    descriptor: int
-    size: int
-    etag: str
-    modified_at: float
-
-
-def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
+def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[OpenFile]:
     """Open a result until the answer has been sent, or refuse the request."""
     view(service, caller, job)
     nothing = ApiError("not-found", f"{job} has no such result")
@@ -79,16 +70,16 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         raise nothing from None
     if not request.scope["path"].endswith(f"/{name}"):  # the router drops a line break at the end
         raise nothing
-    file = service.storage.open_file(layout.results(caller.project, job), name)
+    file = service.storage.open(layout.results(caller.project, job), name)
     if file is None:
         raise nothing
     try:
-        yield Opened(name, file.descriptor, file.size, f'"{file.version}"', file.modified_at)
+        yield file
     finally:
         os.close(file.descriptor)
 
 
-def opened_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> Iterator[Opened]:
+def opened_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> Iterator[OpenFile]:
     """Open the image of an environment until the answer has been sent, or refuse the request."""
     row = row_of(service, caller, environment)
     if row["state"] != READY:
@@ -97,10 +88,11 @@ def opened_environment(service: ServiceDep, caller: Reader, environment: Environ
     with ExitStack() as held:
         if row["folder"] is None:
             prefix = layout.intake(caller.project, environment)
-            found = [service.storage.open(prefix, file.name) for file in service.storage.files(prefix)]
-            if len(found) != 1 or found[0] is None:
+            names = [found.name for found in service.storage.files(prefix)]
+            file = service.storage.open(prefix, names[0]) if len(names) == 1 else None
+            if file is None:
                 raise gone
-            path = found[0]
+            held.callback(os.close, file.descriptor)
         else:
             path = FilePath(row["folder"])
             root = next((root for root in service.settings.roots_of(caller.project) if path.is_relative_to(root)), None)
@@ -108,15 +100,11 @@ def opened_environment(service: ServiceDep, caller: Reader, environment: Environ
                 raise gone
             try:
                 held.enter_context(inputs.confined(path.parent, root))
+                image = held.enter_context(inputs.opened(path)).file
             except StageError:
                 raise gone from None
-        try:
-            file = held.enter_context(inputs.opened(path)).file
-        except StageError:
-            raise gone from None
-        status = os.fstat(file.fileno())
-        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
-        yield Opened(path.name, file.fileno(), status.st_size, etag, status.st_mtime)
+            file = OpenFile.of(path.name, image.fileno())
+        yield file
 
 
 @router.get("", summary="List the results of a job")
@@ -132,13 +120,13 @@ def list_results(service: ServiceDep, caller: Reader, job: JobName,
 
 
 @router.get("/{name:path}", responses=DOWNLOAD, response_class=Response, summary="Download a result")
-async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
+async def download_result(file: Annotated[OpenFile, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
                           wanted: Wanted = None, if_range: IfRange = None) -> Response:
     """Send a file, or a part of it. Under one ETag a file never changes, so that an interrupted download can be continued."""
     headers = headers_of(file)
     if unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
-    part = _part(wanted or "", file) if if_range is None or if_range == file.etag else None
+    part = _part(wanted or "", file) if if_range is None or if_range == _etag(file) else None
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{file.size}"
     sent = range(file.size) if part is None else part
@@ -148,7 +136,7 @@ async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Ta
 
 @router.head("/{name:path}", responses={200: DOWNLOAD[200], 304: DOWNLOAD[304], 412: DOWNLOAD[412]}, response_class=Response,
              summary="Size and ETag of a result")
-async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
+async def head_result(file: Annotated[OpenFile, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
     """Send the headers of a download, without the file."""
     headers = headers_of(file)
     if unchanged(file, if_match, if_none_match):
@@ -157,17 +145,17 @@ async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags =
 
 
 @environments.get("/{environment}/file", responses=DOWNLOAD, response_class=Response, summary="Download the image of an environment")
-async def download_environment(file: Annotated[Opened, Depends(opened_environment)], if_match: Tags = None, if_none_match: Tags = None,
+async def download_environment(file: Annotated[OpenFile, Depends(opened_environment)], if_match: Tags = None, if_none_match: Tags = None,
                                wanted: Wanted = None, if_range: IfRange = None) -> Response:
     """Send the image of an environment that is ready, or a part of it."""
     return await download_result(file, if_match, if_none_match, wanted, if_range)
 
 
-def unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:
+def unchanged(file: OpenFile, if_match: str | None, if_none_match: str | None) -> bool:
     """Return whether the asker has a file already; refuse the request where it is for another than the file is now."""
-    if if_match is not None and not _names(if_match, file.etag, strong=True):
-        raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {file.etag}", headers={"ETag": file.etag})
-    return if_none_match is not None and _names(if_none_match, file.etag, strong=False)
+    if if_match is not None and not _names(if_match, _etag(file), strong=True):
+        raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {_etag(file)}", headers={"ETag": _etag(file)})
+    return if_none_match is not None and _names(if_none_match, _etag(file), strong=False)
 
 
 def _names(header: str, etag: str, *, strong: bool) -> bool:
@@ -175,7 +163,7 @@ def _names(header: str, etag: str, *, strong: bool) -> bool:
     return header.strip() == "*" or any(tag == etag and not (weak and strong) for weak, tag in TAG.findall(header))
 
 
-def _part(header: str, file: Opened) -> range | None:
+def _part(header: str, file: OpenFile) -> range | None:
     """Return the bytes that a Range header names; None where it is malformed or names several, which may be ignored (RFC 9110, 14.2)."""
     found = RANGE.fullmatch(header)
     if found is None:
@@ -191,15 +179,19 @@ def _part(header: str, file: Opened) -> range | None:
     return part
 
 
-def headers_of(file: Opened) -> dict[str, str]:
+def _etag(file: OpenFile) -> str:
+    return f'"{file.version}"'
+
+
+def headers_of(file: OpenFile) -> dict[str, str]:
     """Return the headers of an answer with a file."""
     name = PurePosixPath(file.name).name
     plain = f'filename="{name}"' if name.isascii() else f"filename*=UTF-8''{quote(name)}"
-    return {"ETag": file.etag, "Last-Modified": formatdate(file.modified_at, usegmt=True), "Accept-Ranges": "bytes",
+    return {"ETag": _etag(file), "Last-Modified": formatdate(file.modified_at, usegmt=True), "Accept-Ranges": "bytes",
             "Cache-Control": "private, no-cache", "Content-Disposition": f"attachment; {plain}", "X-Content-Type-Options": "nosniff"}
 
 
-def _media_type(file: Opened) -> str:
+def _media_type(file: OpenFile) -> str:
     return MEDIA_TYPES.get(PurePosixPath(file.name).suffix.lower(), BYTES)
 
 
@@ -228,10 +220,8 @@ one_at_a_time = anyio.CapacityLimiter(1)
 
 
 @pictures.get("/{name:path}", responses=JPEG, response_class=Response, summary="See a small picture of a result")
-async def result_picture(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
+async def result_picture(file: Annotated[OpenFile, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
     """Send an EXR file as a JPEG of at most 512 × 512 pixels: linear light clipped and encoded as sRGB, over a neutral grey."""
-    from stage.errors import StageError
-
     headers = headers_of(file) | {"Content-Disposition": "inline"}
     del headers["Accept-Ranges"]
     if unchanged(file, if_match, if_none_match):

@@ -16,8 +16,8 @@ from service.server.api.context import Service
 from service.server.api.problems import ApiError
 from service.server.base import telemetry
 from service.server.database import audit, intakes, jobs, quotas
+from service.server.database.jobs import SEQUENCE
 from service.server.database.keys import Caller
-from service.server.jobs.context import SEQUENCE
 
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")

@@ -1,9 +1,9 @@
 """The headers of the tus 1.0 protocol (https://tus.io/protocols/resumable-upload)."""
 
-import binascii
 import hashlib
 import re
 from base64 import b64decode, b64encode
+from contextlib import suppress
 from email.utils import formatdate
 from typing import Annotated, Any, NamedTuple
 
@@ -49,10 +49,11 @@ class Checksum(NamedTuple):
         algorithm, _, text = header.partition(" ")
         if algorithm not in ALGORITHMS:
             raise ApiError("bad-request", f"Upload-Checksum: give {' or '.join(ALGORITHMS)}, a space, and the digest in base64")
-        digest = _decoded(text)
-        if digest is None or len(digest) != hashlib.new(algorithm).digest_size:
-            raise ApiError("bad-request", f"Upload-Checksum: what follows {algorithm} is not its digest in base64")
-        return cls(algorithm, digest)
+        with suppress(ValueError):
+            digest = b64decode(text, validate=True)
+            if len(digest) == hashlib.new(algorithm).digest_size:
+                return cls(algorithm, digest)
+        raise ApiError("bad-request", f"Upload-Checksum: what follows {algorithm} is not its digest in base64")
 
 
 class Metadata(NamedTuple):
@@ -71,13 +72,10 @@ class Metadata(NamedTuple):
                 raise ApiError("invalid", f"Upload-Metadata: {key[:40]!a} is not a known key: give path and, if you like, sha256")
             if key in found:
                 raise ApiError("invalid", f"Upload-Metadata: {key} is given twice")
-            value = _decoded(text)
             try:
-                found[key] = "" if value is None else value.decode()
-            except UnicodeDecodeError:
-                value = None
-            if value is None:
-                raise ApiError("invalid", f"Upload-Metadata: {key} is not UTF-8 text in base64")
+                found[key] = b64decode(text, validate=True).decode()
+            except ValueError:
+                raise ApiError("invalid", f"Upload-Metadata: {key} is not UTF-8 text in base64") from None
         if "path" not in found:
             raise ApiError("invalid", "Upload-Metadata: path is missing: the name of the file within the capture, in base64")
         if "sha256" in found and not HEX_SHA256.fullmatch(found["sha256"]):
@@ -129,10 +127,3 @@ class TusHeaders:
 def documented(*names: str) -> dict[str, Any]:
     """Return the headers of an answer for the OpenAPI document."""
     return {name: {"schema": {"type": "string"}} for name in ("Tus-Resumable", *names)}
-
-
-def _decoded(text: str) -> bytes | None:
-    try:
-        return b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
-        return None

@@ -7,10 +7,10 @@ import asyncio
 import contextlib
 import hashlib
 import hmac
+import os
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
 from starlette.requests import ClientDisconnect
 
@@ -23,7 +23,7 @@ from service.server.database import intakes, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, PartFileLocked
+from service.server.storage.upload_parts import PartFileLocked
 
 BUSY_RETRY_S = 1
 BLOCK = 1 << 20
@@ -43,106 +43,17 @@ being_written: set[str] = set()
 """Identifiers of the uploads that a PATCH of this process has locked."""
 
 
-class BodyBroken(Exception):
-    """The body did not come to its end; the message is one sentence."""
-
-
-class TooLong(Exception):
-    """More bytes came than the length of the upload."""
-
-
-class PartFileWriter:
-    """Appends blocks to a part file, flushes them, and hashes them in another thread."""
-
-    def __init__(self, part: PartFile, start: int, length: int, *, digests: list[Any], save: Callable[[int], None] | None,
-                 guard: Callable[[], None]) -> None:
-        """Create the writer of a part file that is cut to `start`; `guard` is called from time to time, and raises if no space is left.
-
-        `save` is called with offsets up to which all bytes are on the disk; None: nothing counts before the whole body is verified.
-        """
-        self._part, self._length, self._digests, self._save, self._guard = part, length, digests, save, guard
-        self.at = self._flushed = self._saved = start
-        self._saving: Future[None] | None = None
-
-    async def take(self, pieces: list[bytes]) -> None:
-        """Write and hash one block; the previous one must be finished."""
-        loop = asyncio.get_running_loop()
-        hashing = loop.run_in_executor(None, self._hash, pieces) if self._digests else None
-        try:
-            await loop.run_in_executor(None, self._write, pieces)
-        finally:
-            if hashing is not None:
-                await hashing
-
-    def settle(self) -> None:
-        """Wait for the flush that is under way, and raise its error."""
-        saving, self._saving = self._saving, None
-        if saving is not None:
-            saving.result()
-
-    def _hash(self, pieces: list[bytes]) -> None:
-        for digest in self._digests:
-            for piece in pieces:
-                digest.update(piece)
-
-    def _write(self, pieces: list[bytes]) -> None:
-        size = sum(map(len, pieces))
-        if self.at + size > self._length:
-            raise TooLong
-        self._part.append(pieces)
-        self.at += size
-        if self.at - self._flushed >= FLUSH_EVERY and self.at < self._length:
-            self.settle()
-            self._guard()
-            self._flushed = self.at
-            self._saving = savers.submit(self._flush, self.at)
-
-    def _flush(self, at: int) -> None:
-        self._part.sync()
-        if self._save is not None and at - self._saved >= SAVE_EVERY:
-            self._save(at)
-            self._saved = at
-
-
-async def write_body(stream: AsyncIterator[bytes], writer: PartFileWriter) -> None:
-    """Write a body to a part file, block by block; after BodyBroken or TooLong the bytes that were written stay."""
-    loop = asyncio.get_running_loop()
-    writing: asyncio.Task[None] | None = None
-    block, size = list[bytes](), 0
-    try:
-        async with asyncio.timeout(IDLE_S) as idle:
-            async for chunk in stream:
-                block.append(chunk)
-                size += len(chunk)
-                if size < BLOCK and len(block) < MAX_PIECES:
-                    idle.reschedule(loop.time() + IDLE_S)
-                    continue
-                idle.reschedule(None)  # a slow disk is not the client's fault
-                if writing is not None:
-                    await writing
-                writing, block, size = loop.create_task(writer.take(block)), [], 0
-                idle.reschedule(loop.time() + IDLE_S)
-    except TimeoutError:
-        raise BodyBroken(f"nothing came for {IDLE_S:g} s") from None
-    except ClientDisconnect:
-        raise BodyBroken("the connection ended before the body did") from None
-    finally:
-        if writing is not None:
-            await writing
-        if block:
-            await writer.take(block)
-
-
 class UploadPatch:
     """A PATCH of an upload, whose part file is locked until `close`.
 
-    The methods wait for the disk or the database: call them from a thread.
+    The methods other than `write` wait for the disk or the database: call them from a thread.
     """
 
     def __init__(self, service: Service, caller: Caller, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
         """Lock the part file at the offset from which the client continues, and cut off bytes that were not counted."""
         self._service, self._caller, self._row, self._checksum = service, caller, upload, checksum
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
+        self._saving: Future[None] | None = None
         try:
             self._part = service.parts.open(upload)
         except PartFileLocked:
@@ -156,7 +67,7 @@ class UploadPatch:
 
     def _begin(self, offset: int) -> None:
         self._row = row = self._still_there()  # as it is under the lock
-        start = self._saved = safe_offset(row, self._part.size)
+        start = self._at = self._flushed = self._saved = received_of(self._service, row)
         if row["done"]:
             self._part.drop()  # opening it made an empty file
         if offset != start:
@@ -166,16 +77,42 @@ class UploadPatch:
             self._part.cut(start)
         # a file that comes in one request is hashed meanwhile, one that comes in several is read when it is complete
         self._whole = hashlib.sha256() if row["sha256"] is not None and not row["done"] and start == 0 else None
-        digests = [digest for digest in (self._digest, self._whole) if digest is not None]
-        self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
-                             save=self._save if self._checksum is None and self._service.parts.saves_while_writing else None,
-                             guard=self._guard)
+        self._digests = [digest for digest in (self._digest, self._whole) if digest is not None]
+
+    async def write(self, stream: AsyncIterator[bytes]) -> str | None:
+        """Write a body to the part file, block by block; return why it did not come to its end. What has come is written in any case."""
+        loop = asyncio.get_running_loop()
+        writing: asyncio.Task[None] | None = None
+        block, size = list[bytes](), 0
+        try:
+            async with asyncio.timeout(IDLE_S) as idle:
+                async for chunk in stream:
+                    block.append(chunk)
+                    size += len(chunk)
+                    if size < BLOCK and len(block) < MAX_PIECES:
+                        idle.reschedule(loop.time() + IDLE_S)
+                        continue
+                    idle.reschedule(None)  # a slow disk is not the client's fault
+                    if writing is not None:
+                        await writing
+                    writing, block, size = loop.create_task(self._take(block)), [], 0
+                    idle.reschedule(loop.time() + IDLE_S)
+        except TimeoutError:
+            return f"nothing came for {IDLE_S:g} s"
+        except ClientDisconnect:
+            return "the connection ended before the body did"
+        finally:
+            if writing is not None:
+                await writing
+            if block:
+                await self._take(block)
+        return None
 
     def end(self, broken: str | None) -> Row:
-        """Verify and count the bytes that came, and return the row of the upload as it is now; `broken` says why the body did not end."""
+        """Verify and count the bytes that came, and return the row of the upload as it is now; `broken` is what `write` has returned."""
         if self._row["done"]:
             return self._row
-        self.writer.settle()
+        self._settle()
         try:
             require_valid(self._service, self._caller)
         except ApiError:
@@ -188,18 +125,18 @@ class UploadPatch:
                 raise ApiError("bad-request", broken) if broken is not None else ApiError(
                     "checksum-mismatch", "Upload-Checksum: the body has another: its bytes are dropped")
         self._part.sync()
-        if self.writer.at == self._row["length"]:
+        if self._at == self._row["length"]:
             self._complete()
         else:
-            self._save(self.writer.at)
+            self._save(self._at)
             if broken is not None:
                 raise ApiError("bad-request", broken)
-        return {**self._row, "received": self.writer.at, "done": self.writer.at == self._row["length"], "touched_at": time.time()}
+        return {**self._row, "received": self._at, "done": self._at == self._row["length"], "touched_at": time.time()}
 
     def give_up(self) -> None:
         """Cut off bytes that were not counted; if the disk refuses that, the next PATCH does it."""
         with contextlib.suppress(Exception):
-            self.writer.settle()
+            self._settle()
         with contextlib.suppress(OSError):
             self._part.cut(self._saved)
 
@@ -208,13 +145,49 @@ class UploadPatch:
         self._part.close()
         being_written.discard(self._row["id"])
 
-    def _guard(self) -> None:
-        require_space(self._service, FOR_UPLOAD)
-        require_valid(self._service, self._caller)
+    async def _take(self, pieces: list[bytes]) -> None:
+        """Write and hash one block; the previous one must be finished."""
+        loop = asyncio.get_running_loop()
+        hashing = loop.run_in_executor(None, self._hash, pieces) if self._digests else None
+        try:
+            await loop.run_in_executor(None, self._append, pieces)
+        finally:
+            if hashing is not None:
+                await hashing
+
+    def _hash(self, pieces: list[bytes]) -> None:
+        for digest in self._digests:
+            for piece in pieces:
+                digest.update(piece)
+
+    def _append(self, pieces: list[bytes]) -> None:
+        size = sum(map(len, pieces))
+        if self._at + size > self._row["length"]:
+            raise too_long(self._row)
+        self._part.append(pieces)
+        self._at += size
+        if self._at - self._flushed >= FLUSH_EVERY and self._at < self._row["length"]:
+            self._settle()
+            require_space(self._service, FOR_UPLOAD)
+            require_valid(self._service, self._caller)
+            self._flushed = self._at
+            self._saving = savers.submit(self._flush, self._at)
+
+    def _flush(self, at: int) -> None:
+        self._part.sync()
+        # with a checksum nothing counts before the whole body is verified
+        if self._checksum is None and self._service.parts.saves_while_writing and at - self._saved >= SAVE_EVERY:
+            self._save(at)
+
+    def _settle(self) -> None:
+        """Wait for the flush that is under way, and raise its error."""
+        saving, self._saving = self._saving, None
+        if saving is not None:
+            saving.result()
 
     def _save(self, at: int) -> None:
         self._saved = at
-        if not self._service.parts.save(self._part, self._row["id"], at):
+        if not self._part.save(at):
             self._gone()
 
     def _complete(self) -> None:
@@ -225,8 +198,8 @@ class UploadPatch:
             raise ApiError("checksum-mismatch", f"{shown(row['path'])}: has another sha256 than was said: all its bytes are dropped")
         self._still_there()
         prefix = layout.intake(row["project"], row["intake"])
-        service.storage.put(service.parts.whole(self._part), prefix, row["path"])
-        if not service.parts.finish(self._part, row["id"], row["length"]):
+        service.storage.put(self._part.whole(), prefix, row["path"])
+        if not self._part.finish():
             if intakes.find(service.database, row["intake"], row["project"]) is None:  # which finds no row of what it would have to delete
                 service.storage.remove(prefix)
             self._gone()
@@ -254,10 +227,15 @@ def _locked(row: Row) -> ApiError:
     return ApiError("locked", f"{row['id']}: another request is adding to it", headers={"Retry-After": str(BUSY_RETRY_S)})
 
 
-def safe_offset(row: Row, there: int) -> int:
-    """Return the bytes of an upload that the client need not send again: none, if its part file, of `there` bytes, lacks some."""
+def too_long(row: Row) -> ApiError:
+    """Return the refusal of a body with more bytes than the length of the upload."""
+    return ApiError("too-large", f"the body goes beyond the {row['length']} bytes that Upload-Length said")
+
+
+def received_of(service: Service, row: Row) -> int:
+    """Return the bytes of an upload that the client need not send again: none, if its part file lacks some of those that were counted."""
     received = int(row["received"])
-    return received if row["done"] or there >= received else 0
+    return received if row["done"] or service.parts.size(row) >= received else 0
 
 
 def settled(service: Service, row: Row) -> Row:
@@ -266,11 +244,9 @@ def settled(service: Service, row: Row) -> Row:
         return row
     # not an older file of this path: that was deleted when the upload began
     moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])
-    if moved is None or moved.stat().st_size != row["length"] or not uploads.finish(service.database, row["id"], row["length"]):
+    if moved is None:
+        return row
+    os.close(moved.descriptor)
+    if moved.size != row["length"] or not uploads.finish(service.database, row["id"], row["length"]):
         return row
     return {**row, "received": row["length"], "done": True}
-
-
-def received_of(service: Service, row: Row) -> int:
-    """Return the number of bytes of an upload that the client need not send again."""
-    return safe_offset(row, 0 if row["done"] else service.parts.size(row))

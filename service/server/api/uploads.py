@@ -15,13 +15,13 @@ from service.server.api import tus
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
-from service.server.api.upload_patch import BodyBroken, TooLong, UploadPatch, being_written, received_of, settled, write_body
+from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled, too_long
 from service.server.base.safe_names import check_path, shown
 from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.storage import layout
-from service.server.storage.part_files import PartFileLocked
+from service.server.storage.upload_parts import PartFileLocked
 
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[tus.Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
@@ -108,9 +108,14 @@ async def patch_upload(
     row: Row = await asyncio.to_thread(_row, service, caller, upload)
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
-        raise _too_long(row)
+        raise too_long(row)
     with closing(await asyncio.to_thread(UploadPatch, service, caller, row, offset=offset, checksum=expected)) as patch:
-        row = await _take(patch, request, row)
+        try:
+            broken = await patch.write(request.stream())
+        except Exception:
+            await asyncio.to_thread(patch.give_up)
+            raise
+        row = await asyncio.to_thread(patch.end, broken)
     response.headers.update(tus.state_headers(row, row["received"], service.settings.upload_hours))
 
 
@@ -122,7 +127,7 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
         part = service.parts.open(row)
     except PartFileLocked:
         raise ApiError("locked", f"{upload}: a request is adding to it", headers={"Retry-After": "1"}) from None
-    with part:
+    with closing(part):
         def work(connection: sa.Connection) -> None:
             _hold(service, caller, connection, row["intake"])
             if uploads.remove(connection, upload):
@@ -134,21 +139,6 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
         finally:
             if row["done"] or uploads.find(service.database, upload, caller.project) is None:
                 part.drop()
-
-
-async def _take(patch: UploadPatch, request: Request, row: Row) -> Row:
-    broken = None
-    try:
-        try:
-            await write_body(request.stream(), patch.writer)
-        except BodyBroken as error:
-            broken = str(error)
-        except TooLong:
-            raise _too_long(row) from None
-    except Exception:
-        await asyncio.to_thread(patch.give_up)
-        raise
-    return await asyncio.to_thread(patch.end, broken)
 
 
 def _create(service: Service, caller: Caller, intake: str, length: int, given: tus.Metadata, token: str | None, response: Response,
@@ -182,11 +172,11 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+    upload = idempotency.create_once(service.database, caller.project, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
     if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
-        upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
+        upload = idempotency.create_once(service.database, caller.project, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
@@ -231,7 +221,3 @@ def _row(service: Service, caller: Caller, upload: str) -> Row:
 
 def _expired(service: Service, row: Row) -> bool:
     return not row["done"] and tus.expires_at(row, service.settings.upload_hours) < time.time()
-
-
-def _too_long(row: Row) -> ApiError:
-    return ApiError("too-large", f"the body goes beyond the {row['length']} bytes that Upload-Length said")

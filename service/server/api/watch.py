@@ -8,7 +8,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from service.requests.answers import JobView
-from service.requests.base.identifiers import JOB, KEY
+from service.requests.base.identifiers import JOB
 from service.requests.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.base.log import logger
@@ -132,10 +132,7 @@ class Watcher:
         rows = await asyncio.to_thread(jobs.revisions, self._database, list(changed | missing)) if changed | missing else {}
         await self._close_revoked(now=bool(changed | missing))
         for job in changed | missing:
-            if (row := rows.get(job)) is not None:
-                self._tell(row, present)
-            else:
-                self._tell_gone(job, present)
+            self._tell(job, rows.get(job), present)
         self._seen = {job: (row["project"], rows.get(job, row)["revision"]) for job, row in found.items()
                       if job not in changed or job in rows}
         for listener in present:
@@ -145,32 +142,25 @@ class Watcher:
         """End the streams of keys and tokens that were revoked or have expired; unless `now`, look at the keys every KEYS_S only."""
         if not now and time.monotonic() < self._keys_until:
             return
-        used = {listener.caller.key or "" for listener in self._all() if listener.caller is not None
-                and (listener.caller.key or "").startswith(f"{KEY}_")}
-        valid = await asyncio.to_thread(keys.still_valid, self._database, used) if used else set[str]()
+        callers = {listener.caller for listener in self._all() if listener.caller is not None}
+        gone = await asyncio.to_thread(keys.no_longer_valid, self._database, callers)
         for listener in self._all():
-            caller = listener.caller
-            if caller is not None and (caller.key in used - valid or (caller.until is not None and caller.until < time.time())):
+            if listener.caller in gone:
                 listener.close()
         self._keys_until = time.monotonic() + KEYS_S
 
-    def _tell(self, row: sa.RowMapping, present: set[Listener]) -> None:
-        listeners = self._of(row["id"], row["project"]) & present
-        if self._seen.get(row["id"]) == (row["project"], row["revision"]):
+    def _tell(self, job: str, row: sa.RowMapping | None, present: set[Listener]) -> None:
+        """Offer a job as it is now, or that it is gone, to those of the listeners who were not told."""
+        project, revision = self._seen.get(job, ("", 0)) if row is None else (row["project"], row["revision"])
+        was_told = job not in self._seen if row is None else self._seen.get(job) == (project, revision)
+        listeners = (self._listeners.get(job, set()) | self._listeners.get(project, set())) & present
+        if was_told:
             listeners = {listener for listener in listeners if listener.fresh}
         if listeners:
-            change = Change(row["id"], row["revision"], row["state"] in ENDED, JobView.of(row).model_dump_json(by_alias=True))
+            change = Change(job, revision, True, None) if row is None else Change(
+                job, revision, row["state"] in ENDED, JobView.of(row).model_dump_json(by_alias=True))
             for listener in listeners:
                 listener.offer(change)
-
-    def _tell_gone(self, job: str, present: set[Listener]) -> None:
-        project, revision = self._seen.get(job, ("", 0))
-        for listener in self._of(job, project) & present:
-            if job in self._seen or listener.fresh:
-                listener.offer(Change(job, revision, True, None))
-
-    def _of(self, job: str, project: str) -> set[Listener]:
-        return self._listeners.get(job, set()) | self._listeners.get(project, set())
 
     def _all(self) -> list[Listener]:
         return [listener for listeners in self._listeners.values() for listener in listeners]

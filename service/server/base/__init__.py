@@ -1,1 +1,1 @@
-"""Settings, log, traces, names and locks, which every part of the server uses."""
+"""Settings, log, traces, names, locks and threads, which every part of the server uses."""

@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 
@@ -11,18 +12,16 @@ def take(path: Path, mode: int = 0o600) -> int | None:
     Its folder must exist, and its path must be no link. Closing the descriptor releases the lock.
     """
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if is_named(descriptor, path):
+        with ExitStack() as held:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
+            held.callback(os.close, descriptor)
+            with suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not is_named(descriptor, path):  # the file was deleted or moved between the two calls
+                    continue
+                held.pop_all()
                 return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
             return None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)  # the file was deleted or moved between the two calls
 
 
 def is_named(descriptor: int, path: Path) -> bool:

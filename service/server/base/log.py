@@ -34,11 +34,9 @@ def configure(level: str, form: str) -> None:
         structlog.stdlib.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
-    renderers: list[structlog.typing.Processor] = [structlog.dev.ConsoleRenderer(
-        colors=sys.stderr.isatty(), exception_formatter=_traceback)]
-    renderers.insert(0, _escape)
-    if form == "json":
-        renderers = [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    renderers: list[structlog.typing.Processor] = [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    if form == "text":
+        renderers = [_escape, structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=_traceback)]
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(
         foreign_pre_chain=[*shared, structlog.stdlib.add_logger_name],

@@ -25,11 +25,8 @@ TIMEOUT_S = 10.0
 """Seconds from the look-up of the name to the header of the answer; of its body nothing is read."""
 NAT64 = ip_network("64:ff9b::/96")
 """IPv6 addresses whose last 32 bits are the IPv4 address that is meant (RFC 6052)."""
-
 UNICAST = ip_network("2000::/3")
 """The IPv6 addresses that are given to hosts (RFC 4291). Others, such as ::127.0.0.1, can lead to addresses of IPv4."""
-
-
 NO_ADDRESS = "the host has no address for hooks: it needs a public one and https://, or one in a network of the setting hook_networks"
 """What users read where a name is not found or not allowed, so that nobody learns the names inside; the log of the service says which."""
 

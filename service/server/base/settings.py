@@ -79,6 +79,12 @@ def _reader(pattern: str, form: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+def _several(mark: str) -> BeforeValidator:
+    """Return a validator that takes a text apart at a mark."""
+    return BeforeValidator(lambda given: [part.strip() for part in given.split(mark) if part.strip()] if isinstance(given, str) else given)
+
+
+COMMAS, PATHS = _several(","), _several(os.pathsep)
 Quoted = Annotated[ProjectQuota, _reader(rf"<project>:({'|'.join(QUOTAS)})=([0-9]{{1,18}})",
                                          f"PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")]
 Granted = Annotated[Grant, _reader(rf"(.+)=<project>:({'|'.join(Scope)})", f"VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")]
@@ -111,13 +117,13 @@ class Settings(BaseSettings):
     """The audience (`aud`) that a token must have."""
     oidc_claim: str = "groups"
     """Claim of a token whose text or texts `oidc_grants` maps to projects."""
-    oidc_grants: Annotated[tuple[Granted, ...], NoDecode] = ()
+    oidc_grants: Annotated[tuple[Granted, ...], NoDecode, COMMAS] = ()
     """The rights that a value of the claim grants: VALUE=PROJECT:SCOPE, separated by commas."""
-    roots: Annotated[tuple[Folder, ...], NoDecode] = ()
+    roots: Annotated[tuple[Folder, ...], NoDecode, PATHS] = ()
     """Folders of the server whose captures and environments may be registered without an upload; in the environment separated by `:`."""
-    project_roots: Annotated[tuple[ProjectFolder, ...], NoDecode] = ()
+    project_roots: Annotated[tuple[ProjectFolder, ...], NoDecode, PATHS] = ()
     """As `roots`, each for one project: PROJECT=/folder; in the environment separated by `:`."""
-    devices: Annotated[tuple[str, ...], NoDecode] = ()
+    devices: Annotated[tuple[str, ...], NoDecode, COMMAS] = ()
     """Devices on which `relit serve` starts a worker, separated by commas; without it every GPU, else the CPU; `none` for no worker."""
 
     max_upload_bytes: Count = 64 * 1024**3
@@ -140,7 +146,7 @@ class Settings(BaseSettings):
     """Pixels of all images of the captures and environments of one project at most; without it any number."""
     max_project_hooks: Count = 16
     """Hooks of one project at most."""
-    project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
+    project_quotas: Annotated[tuple[Quoted, ...], NoDecode, COMMAS] = ()
     """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
     """Requests of one key a second, on average, in each API process; a new capture or environment counts as ten."""
@@ -156,9 +162,9 @@ class Settings(BaseSettings):
     """Event streams of one key at most, in each API process."""
     max_project_streams: Count = 512
     """Event streams of one project at most, in each API process."""
-    trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
+    trusted_proxies: Annotated[tuple[str, ...], NoDecode, COMMAS] = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
-    hook_networks: Annotated[tuple[str, ...], NoDecode] = ()
+    hook_networks: Annotated[tuple[str, ...], NoDecode, COMMAS] = ()
     """Addresses or networks that are not public, to which hooks may send all the same, separated by commas; without it none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3
     """Bytes that must be free in the data folder; uploads and jobs are refused when less is left."""
@@ -188,15 +194,6 @@ class Settings(BaseSettings):
     """Format of the lines of the log."""
     otel_endpoint: str | None = None
     """http://collector:4318, to whose /v1/traces traces are sent (needs the extra `otel`); without it none are sent."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _split(cls, given: dict[str, object]) -> dict[str, object]:
-        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ","),
-                           ("hook_networks", ","), ("oidc_grants", ","), ("project_quotas", ",")):
-            if isinstance(value := given.get(name), str):
-                given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
-        return given
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -13,6 +13,7 @@ from typing import TypeVar
 import sqlalchemy as sa
 import structlog
 
+from service.requests.keys import Scope
 from service.server.database.engine import Database, begin_writing
 from service.server.database.keys import DAY_S, Caller
 from service.server.database.tables import audit
@@ -31,8 +32,9 @@ TRIGGERS = {"sqlite": ("relit_audit_update", "relit_audit_delete"), "postgresql"
 
 def record(connection: sa.Connection, caller: Caller, action: str, target: str) -> None:
     """Write that a caller changed an object, in the transaction of the change; an action is such as `job.cancel`."""
-    request = structlog.contextvars.get_contextvars().get("request")
-    _insert(connection, caller.project, caller.key or ANONYMOUS, action, target, request)
+    connection.execute(audit.insert().values(
+        project=caller.project, at=time.time(), actor=(caller.key or ANONYMOUS)[:200], action=action, object=target,
+        request=structlog.contextvars.get_contextvars().get("request")))
 
 
 def recorded(database: Database, caller: Caller, action: str, target: str, change: Callable[[sa.Connection], T]) -> T:
@@ -47,7 +49,11 @@ def recorded(database: Database, caller: Caller, action: str, target: str, chang
 
 def record_operator(connection: sa.Connection, project: str, action: str, target: str) -> None:
     """Write that somebody changed an object by the command line on the server."""
-    _insert(connection, project, f"operator {_user()}", action, target, None)
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user without a name
+        user = "unknown"
+    record(connection, Caller(project, Scope.ADMIN, f"operator {user}"), action, target)
 
 
 def listing(database: Database, *, project: str | None = None, limit: int, before: int | None = None) -> list[sa.RowMapping]:
@@ -109,15 +115,3 @@ def _sum_up(connection: sa.Connection, project: str, begin: float) -> int:
         {"project": project, "at": last, "actor": actor, "action": action, "object": f"{count}{MORE}"}
         for (actor, action), count in counts.items()])
     return gone - len(counts)
-
-
-def _insert(connection: sa.Connection, project: str, actor: str, action: str, target: str, request: str | None) -> None:
-    connection.execute(audit.insert().values(project=project, at=time.time(), actor=actor[:200], action=action, object=target,
-                                             request=request))
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a user without a name
-        return "unknown"

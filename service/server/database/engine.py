@@ -16,6 +16,8 @@ from service.server.base.settings import Settings
 T = TypeVar("T")
 BUSY_MS = 30_000
 """Milliseconds for which a write on SQLite waits for that of another process."""
+OPTIONS: dict[str, dict[str, Any]] = {"sqlite": {}, "postgresql": {"pool_pre_ping": True, "connect_args": {
+    "application_name": "relit", "connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}}}
 PROJECT = 11
 """Seed of the hash of projects' names, so that these advisory locks do not coincide with those of other programs."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
@@ -79,17 +81,14 @@ def connect(url: str, *, connections: int = 10) -> Database:
     """Open a database by its URL for SQLAlchemy (sqlite:///path or postgresql+psycopg://…); nothing is created."""
     try:
         parsed = sa.make_url(url)
-        if parsed.get_backend_name() == "sqlite":
-            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30)
-            sa.event.listen(engine, "connect", _sqlite)
-        elif parsed.get_backend_name() == "postgresql":
-            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30, pool_pre_ping=True,
-                                      connect_args={"application_name": "relit", "connect_timeout": 10, "keepalives_idle": 5,
-                                                    "keepalives_interval": 2, "keepalives_count": 3})
-        else:
-            raise DatabaseError(f"database_url: {parsed.get_backend_name()} is not supported: give postgresql://…, or none for SQLite")
+        kind = parsed.get_backend_name()
+        if kind not in OPTIONS:
+            raise DatabaseError(f"database_url: {kind} is not supported: give postgresql://…, or none for SQLite")
+        engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30, **OPTIONS[kind])
     except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError, ValueError) as error:  # ValueError: a port that is no number
         raise DatabaseError("database_url: is not of the form postgresql://user:password@host/name") from error
+    if kind == "sqlite":
+        sa.event.listen(engine, "connect", _sqlite)
     return Database(engine)
 
 

@@ -18,24 +18,24 @@ class TokenReused(RequestError):
     """The token was sent with another request before; the message says so."""
 
 
-def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something once for a token of the client, or, with None, at every request; return its identifier, and if it was created now.
+def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> str:
+    """Create something once for a token of the client, or, with None, at every request; return its identifier.
 
     `asked` has all values of the request, as JSON can hold them; `make` creates in the transaction, and returns the identifier.
     """
     if token is None:
-        return database.transact(make), True
+        return database.transact(make)
     fingerprint = _fingerprint(asked)
 
-    def work(connection: sa.Connection) -> tuple[str, bool]:
+    def work(connection: sa.Connection) -> str:
         row = connection.execute(sa.select(idempotency).where(*_is(project, token))).mappings().one_or_none()
         if row is not None:
-            return _same(row, fingerprint), False
+            return _same(row, fingerprint)
         connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made="",
                                                        created_at=time.time()))  # the same request at the same time waits here
         created = make(connection)
         connection.execute(idempotency.update().where(*_is(project, token)).values(made=created))
-        return created, True
+        return created
 
     try:
         return database.transact(work)

@@ -1,4 +1,4 @@
-"""Intakes: captures and environments, uploaded or registered where they lie.
+"""Intakes: captures and environments, uploaded or registered where they lie, and the annotations of captures, which go with them.
 
 receiving (an upload) → checking → ready | refused. The files of an intake do not change while it is checking or ready.
 """
@@ -9,11 +9,14 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.requests.base.identifiers import ANNOTATION, new_id
 from service.requests.states import CHECKING, READY, RECEIVING, REFUSED
 from service.server.database.engine import Database, storable
 from service.server.database.jobs import PATIENCE_S
-from service.server.database.tables import intakes, job_inputs, jobs, newest_first, uploads
+from service.server.database.tables import annotations, intakes, job_inputs, jobs, newest_first, uploads
 
+MOST_ANNOTATIONS = 500
+"""Annotations of one capture."""
 PROPOSAL = "proposal"
 """The fact of a capture that has no manifest: how its files can be imported."""
 
@@ -93,6 +96,28 @@ def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
     parts = list(connection.execute(sa.select(uploads.c.id).where(uploads.c.intake == identifier, uploads.c.done.is_(False))).scalars())
     connection.execute(uploads.delete().where(uploads.c.intake == identifier))
     return parts if connection.execute(intakes.delete().where(intakes.c.id == identifier)).rowcount == 1 else None
+
+
+def annotations_of(database: Database, capture: str) -> list[sa.RowMapping]:
+    """Return the annotations of a capture, the oldest first."""
+    of_capture = sa.select(annotations).where(annotations.c.intake == capture)
+    return database.rows(of_capture.order_by(annotations.c.created_at, annotations.c.id))
+
+
+def annotate(connection: sa.Connection, capture: str, content: dict[str, object]) -> sa.RowMapping | None:
+    """Insert an annotation, and return its row; None: the capture has MOST_ANNOTATIONS already, or is gone."""
+    locked = intakes.update().where(intakes.c.id == capture).values(name=intakes.c.name)  # so that the count stays
+    if connection.execute(locked).rowcount != 1:
+        return None
+    if connection.execute(sa.select(sa.func.count()).where(annotations.c.intake == capture)).scalar_one() >= MOST_ANNOTATIONS:
+        return None
+    return connection.execute(annotations.insert().values(
+        id=new_id(ANNOTATION), intake=capture, content=content, created_at=time.time()).returning(annotations)).mappings().one()
+
+
+def remove_annotation(connection: sa.Connection, capture: str, identifier: str) -> bool:
+    """Delete an annotation of a capture; return False if there is none."""
+    return connection.execute(annotations.delete().where(annotations.c.id == identifier, annotations.c.intake == capture)).rowcount == 1
 
 
 def _judge(database: Database, identifier: str, allow: Callable[[sa.Connection], None] | None, **values: Any) -> None:

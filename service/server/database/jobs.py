@@ -20,6 +20,8 @@ from service.server.database.tables import intakes, job_inputs, job_log, jobs, n
 
 FRAMES = "frames"
 """The stage that counts frames."""
+SEQUENCE = "sequence"
+"""Name of the last step of a solve or a depth of a sequence, which joins its time steps."""
 PATIENCE_S = 600.0
 """Seconds that a change by a worker waits for a database that does not answer."""
 LATELY_S = 60.0
@@ -47,16 +49,6 @@ NOTHING_LOST: dict[str, Any] = {"lost": 0, "lost_repeating": 0, "stages_begun": 
 """Values of a job at the beginning of a step."""
 REPEATED = 10
 """Number of times that `max_lost` workers may die one after the other in stages that earlier workers came through."""
-
-
-class StageProgress(NamedTuple):
-    """The progress of a job in its stage."""
-
-    stage: str
-    done: int
-    total: int
-    rate: float | None
-    """Counts a second."""
 
 
 def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
@@ -166,17 +158,17 @@ def correct_reached(database: Database, claim: Claim, frames: int) -> bool:
     return _change(database, claim, reached=frames)
 
 
-def advance(database: Database, claim: Claim, progress: StageProgress, *, frames: int | None = None, repeating: bool | None = None,
-            begun: Sequence[str] | None = None, entered: bool = False) -> bool:
+def advance(database: Database, claim: Claim, stage: str, done: int, total: int, rate: float | None, *, frames: int | None = None,
+            repeating: bool | None = None, begun: Sequence[str] | None = None, entered: bool = False) -> bool:
     """Record the progress of a running job, as users see it, without patience; return False if the worker no longer has it.
 
-    More frames than the attempt ever had, and a stage that the step never came to (`begun`), set `lost` to 0, as a finished step does: a
-    job that makes progress does not kill its workers. `repeating` says whether an earlier worker went on from this stage to a further one,
-    `entered` whether the log gets an entry for the stage.
+    `rate` counts are done a second. More frames than the attempt ever had, and a stage that the step never came to (`begun`), set `lost` to
+    0, as a finished step does: a job that makes progress does not kill its workers. `repeating`: an earlier worker went on from this stage
+    to a further one; `entered`: the log gets an entry for the stage.
     """
-    values: dict[str, Any] = progress._asdict()
-    if progress.stage == FRAMES:
-        made = progress.done if frames is None else frames
+    values: dict[str, Any] = {"stage": stage, "done": done, "total": total, "rate": rate}
+    if stage == FRAMES:
+        made = done if frames is None else frames
         further = jobs.c.reached < made
         values |= {"reached": sa.case((further, made), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost),
                    "lost_repeating": sa.case((further, 0), else_=jobs.c.lost_repeating)}
@@ -184,7 +176,7 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, frames
         values["repeating"] = repeating
     if begun is not None:
         values |= {"stages_begun": list(begun), "lost": 0, "lost_repeating": 0}
-    return _change(database, claim, entry=f"{progress.stage}, {progress.total} to do" if entered else None, patience_s=0.0, **values)
+    return _change(database, claim, entry=f"{stage}, {total} to do" if entered else None, patience_s=0.0, **values)
 
 
 def finish_step(database: Database, claim: Claim, steps: Sequence[str], result_bytes: int | None = None) -> bool:

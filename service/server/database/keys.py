@@ -23,10 +23,11 @@ ORDER = list(Scope)
 DAY_S = 86_400.0
 USED_S = 60.0
 """Seconds to which the last use of a key is recorded, so that not every request writes."""
-VALID = sa.and_(keys.c.revoked_at.is_(None), sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
-FOUND = sa.select(keys).where(keys.c.id == sa.bindparam("key"), VALID)
-STILL_VALID = sa.select(keys.c.id).where(keys.c.id.in_(sa.bindparam("keys", expanding=True)), VALID)
-"""Conditions and queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
+FOUND = sa.select(keys).where(keys.c.id == sa.bindparam("key"))
+STILL_VALID = sa.select(keys.c.id).where(
+    keys.c.id.in_(sa.bindparam("keys", expanding=True)), keys.c.revoked_at.is_(None),
+    sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
+"""Queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
 and those of each request would wait for the garbage collector."""
 
 
@@ -54,32 +55,29 @@ def insert(connection: sa.Connection, wanted: NewKey) -> str:
     return f"{identifier}.{secret}"
 
 
-def find(database: Database, presented: str) -> Caller | None:
-    """Return the caller to whom a key belongs; None: the key is unknown, was revoked or has expired. Record that it was used."""
+def find(database: Database, presented: str) -> Caller | str:
+    """Return the caller to whom a key belongs, or why it is refused; who does not have its secret is told nothing of it.
+
+    A use of the key is recorded.
+    """
     identifier, _, secret = presented.partition(".")
-    row = database.row(FOUND, key=identifier, now=time.time())
+    row, now = database.row(FOUND, key=identifier), time.time()
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
-        return None
-    now = time.time()
+        return "this service does not know the key"
+    if row["revoked_at"] is not None:
+        return f"the key was revoked on {_day(row['revoked_at'])}"
+    if row["expires_at"] is not None and row["expires_at"] <= now:
+        return f"the key expired on {_day(row['expires_at'])}"
     if row["used_at"] is None or abs(now - row["used_at"]) > USED_S:
         database.execute(keys.update().where(keys.c.id == identifier).values(used_at=now))
     return Caller(row["project"], Scope(row["scope"]), identifier, row["expires_at"])
 
 
-def fault_of(database: Database, presented: str) -> str:
-    """Return why a key was refused, in words; who does not have its secret is told nothing of it."""
-    identifier, _, secret = presented.partition(".")
-    row = database.row(sa.select(keys).where(keys.c.id == identifier))
-    if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
-        return "this service does not know the key"
-    if row["revoked_at"] is not None:
-        return f"the key was revoked on {_day(row['revoked_at'])}"
-    return f"the key expired on {_day(row['expires_at'])}"
-
-
-def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
-    """Return those of the keys that have neither been revoked nor expired."""
-    return {row["id"] for row in database.rows(STILL_VALID, keys=list(identifiers), now=time.time())}
+def no_longer_valid(database: Database, callers: Collection[Caller]) -> set[Caller]:
+    """Return those of the callers whose key or token was revoked or has expired."""
+    now, used = time.time(), {caller.key for caller in callers if (caller.key or "").startswith(f"{KEY}_")}
+    valid = {row["id"] for row in database.rows(STILL_VALID, keys=list(used), now=now)} if used else set()
+    return {caller for caller in callers if caller.key in used - valid or (caller.until is not None and caller.until < now)}
 
 
 def revoke(connection: sa.Connection, identifier: str) -> str | None:

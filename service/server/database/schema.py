@@ -8,15 +8,11 @@ Alembic is imported only to make or upgrade tables: its import takes a tenth of 
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import sqlalchemy as sa
 
 from service.server.database import audit, tables
 from service.server.database.engine import Database, DatabaseError
-
-if TYPE_CHECKING:
-    from alembic.config import Config
 
 REVISIONS = "relit_schema"
 """Table in which Alembic keeps the revision of the database."""
@@ -33,11 +29,13 @@ def upgrade(database: Database) -> None:
         else:
             connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": UPGRADE_LOCK})
         found = _revision(connection)
-        if found == _newest():
+        if found == _known()[-1]:
             return
         from alembic import command
+        from alembic.config import Config
 
-        config = _alembic(connection)
+        config = Config(attributes={"connection": connection})
+        config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
         if found is None and not _has_tables(connection):
             tables.metadata.create_all(connection)
             command.stamp(config, "head")
@@ -50,7 +48,7 @@ def upgrade(database: Database) -> None:
 def is_current(database: Database) -> bool:
     """Return whether the tables are those of this program; nothing is changed."""
     with database.engine.connect() as connection:
-        return _revision(connection) == _newest()
+        return _revision(connection) == _known()[-1]
 
 
 def require_current(database: Database) -> None:
@@ -59,7 +57,7 @@ def require_current(database: Database) -> None:
         if not _has_tables(connection):
             raise DatabaseError("the database has no tables of relit: relit serve makes them")
         found = _revision(connection)
-    if found != _newest():
+    if found != _known()[-1]:
         _require_known(found)
         raise DatabaseError("the database has the tables of an older relit: relit serve of this version upgrades them")
 
@@ -80,10 +78,6 @@ def _known() -> list[str]:
     return sorted(file.name[1:].partition("_")[0] for file in (MIGRATIONS / "versions").glob("r*.py"))
 
 
-def _newest() -> str:
-    return _known()[-1]
-
-
 def _require_known(found: str | None) -> None:
     if found is None or found < _known()[0]:
         raise DatabaseError(f"the database has the tables of an early relit (revision {found or 'none'}): start relit serve of version "
@@ -91,11 +85,3 @@ def _require_known(found: str | None) -> None:
     if found not in _known():
         raise DatabaseError(f"the database has the tables of a newer relit (revision {found}): "
                             "use that program, or another data folder or database")
-
-
-def _alembic(connection: sa.Connection) -> "Config":
-    from alembic.config import Config
-
-    config = Config(attributes={"connection": connection})
-    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    return config

@@ -166,7 +166,7 @@ idempotency = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False),
     sa.PrimaryKeyConstraint("project", "token"))
 
-workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks that tell who lives have no device (see worker_lock)
+workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks that tell who lives have no device (see takeover)
     "relit_workers", metadata, sa.Column("id", sa.String(200), primary_key=True),
     sa.Column("host", sa.String(200), nullable=False),
     sa.Column("pid", sa.Integer, nullable=False),

@@ -20,21 +20,16 @@ def insert(database: Database, worker: str, *, host: str, pid: int, device: str)
     database.execute(workers.insert().values(id=worker, host=host, pid=pid, device=device, started_at=now, seen_at=now, state=READY))
 
 
-def record_alive(database: Database, worker: str, state: str = READY) -> None:
-    """Record that a worker is alive, and its state."""
-    database.execute(workers.update().where(workers.c.id == worker).values(seen_at=time.time(), state=state))
+def record_alive(database: Database, worker: str, state: str = READY) -> str | None:
+    """Record that a worker is alive, and its state; return what an operator asks of it."""
+    alive = workers.update().where(workers.c.id == worker).values(seen_at=time.time(), state=state).returning(workers.c.asked)
+    return database.transact(lambda connection: connection.execute(alive).scalar())
 
 
 def ask(connection: sa.Connection, worker: str, what: str) -> bool:
     """Ask something of a worker that was seen lately; return False if there is none."""
     is_there = workers.c.id == worker, workers.c.seen_at > time.time() - SILENT_S
     return connection.execute(workers.update().where(*is_there).values(asked=what)).rowcount == 1
-
-
-def asked_of(database: Database, worker: str) -> str | None:
-    """Return what an operator asks of a worker."""
-    row = database.row(sa.select(workers.c.asked).where(workers.c.id == worker))
-    return None if row is None else row["asked"]
 
 
 def remove(database: Database, worker: str) -> None:

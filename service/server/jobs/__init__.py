@@ -3,7 +3,7 @@
 What happens when a worker dies:
 
 Who notices. Each worker holds a lock that is named after it, which the operating system or PostgreSQL releases when the worker's process or
-machine ends (worker_lock). Every `takeover_s` seconds each worker tries the locks of the others that have jobs according to DBOS, and takes
+machine ends. Every `takeover_s` seconds each worker tries the locks of the others that have jobs according to DBOS, and takes
 over where a lock is free (takeover). The supervisor sees that the process ended and starts another on the device. A worker that hangs
 keeps its lock: the supervisor kills it after `stall_s` seconds without a sign of life or of progress (heartbeat, supervisor).
 
@@ -22,6 +22,6 @@ worker that wakes after another took over its job neither ends a step nor sends 
 workers may write the same file for a moment; a file gets its name only when it is complete, and both have the same content.
 
 What several workers do at once. The worker that has a job asks others for help, by workflows of their own in the same queue, which come
-after the jobs that wait (queue). A helper does pieces of a solve or chunks of frames (helping), and changes nothing in the row of the job.
+after the jobs that wait (queue). A helper does pieces of a solve or chunks of frames (steps), and changes nothing in the row of the job.
 The help of a worker that dies is not queued again: the worker that has the job does what is left.
 """

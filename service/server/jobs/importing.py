@@ -18,7 +18,7 @@ from service.requests.base.identifiers import UPLOAD, new_id
 from service.requests.states import CHECKING
 from service.server.base.safe_names import folded
 from service.server.database import intakes, quotas, uploads
-from service.server.jobs.places import StepFiles
+from service.server.jobs.context import StepFiles
 from service.server.storage import layout
 from stage.capture.manifest import FILE_NAME
 from stage.errors import storage
@@ -123,5 +123,3 @@ def _made(folder: Path, given: frozenset[str]) -> dict[str, int]:
             raise RequestError(f"{name}: is named by the files, and was not uploaded with them")
         made[name] = found.st_size
     return made
-
-

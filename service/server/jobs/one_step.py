@@ -5,8 +5,8 @@ Those that calibrate write manifests and reports among the results, and leave th
 
 import tempfile
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from service.reporting.provenance import name_place
@@ -20,7 +20,7 @@ from service.requests.inspect_board import GaugeBoardRequest, InspectBoardReques
 from service.requests.rig import RigCalibrationRequest
 from service.requests.shade import ShadeRequest
 from service.requests.solve import JoinRequest
-from service.server.jobs.places import StepFiles, file_within
+from service.server.jobs.context import StepFiles, file_within
 from service.server.storage import layout
 from stage.capture.manifest import FILE_NAME
 from stage.capture.sequence import read_sequence
@@ -40,9 +40,18 @@ def _product(function: str, model: type[Options], file: str = "", *, capture_as:
     """Return the function of jobs whose product, a `module:function` that is loaded when it is called, is given nothing but its request.
     `capture_as`: the field for the folder of the job's capture, where the request of the product has another word for it."""
     def make(request: Any, files: StepFiles) -> None:
-        module, _, name = function.partition(":")
         captured = {} if capture_as is None else {capture_as: files.intake(request.capture)}
-        getattr(import_module(module), name)(files.request(model, request, out=files.out / file, **captured, **given), files.progress)
+        resolve_name(function)(files.request(model, request, out=files.out / file, **captured, **given), files.progress)
+
+    return make
+
+
+def _rig(function: str, model: type[Options]) -> Callable[[Any, StepFiles], None]:
+    """Return the function of jobs whose product calibrates the devices of a rig, and writes a manifest for each capture."""
+    def make(request: Any, files: StepFiles) -> None:
+        captures = getattr(request, "captures", None) or (request.capture,)
+        manifests = [files.out / f"{capture}.{FILE_NAME}" for capture in (*captures, *request.apply_to)]
+        resolve_name(function)(files.request(model, request), files.progress, manifest_paths=manifests)
 
     return make
 
@@ -75,7 +84,7 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
     kind = BasisKind(request.options.basis)
     options = {name: value for name, value in dict(request.options).items() if name != "basis"}
     make_basis(BasisRequest(capture=files.intake(request.capture), out=files.out / f"{BASIS}{SUFFIXES[kind]}", kind=kind,
-                            device=files.device, cache=files.cache(request.capture), **options), files.progress)
+                            device=files.context.device, cache=files.cache(request.capture), **options), files.progress)
 
 
 def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
@@ -98,54 +107,40 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
         gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress)
 
 
-def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.StereoCalibrationJob | calibration_jobs.LaserPlanesJob,
-                   files: StepFiles) -> None:
-    from service.calibrate import laser_planes, procam, stereo
-
-    captures = [request.capture] if isinstance(request, calibration_jobs.StereoCalibrationJob) else request.captures
-    paths = [files.out / f"{capture}.{FILE_NAME}" for capture in (*captures, *request.apply_to)]
-    if isinstance(request, calibration_jobs.ProcamJob):
-        procam.procam(files.request(calibrate.ProcamRequest, request), files.progress, manifest_paths=paths)
-    elif isinstance(request, calibration_jobs.StereoCalibrationJob):
-        stereo.stereo(files.request(calibrate.StereoRequest, request), files.progress, manifest_paths=paths)
-    else:
-        laser_planes.laser_planes(files.request(calibrate.LaserPlanesRequest, request), files.progress, manifest_paths=paths)
-
-
 def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles) -> None:
     from service.calibrate.tof import calibrate_tof
     from service.relight.time_steps import time_steps
 
     folder = files.intake(request.capture)
     sweep = file_within(folder, request.sweep, "sweep")
-    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.device), files.progress,
+    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.context.device), files.progress,
                   allowed=time_steps(folder))
 
 
 MEASURE = "measure"
-RIGS = (calibration_jobs.ProcamJob, calibration_jobs.StereoCalibrationJob, calibration_jobs.LaserPlanesJob)
+MEASURED: dict[type[JobRequest], Callable[[Any, StepFiles], None]] = {
+    calibration_jobs.MirrorBallJob: _product("service.calibrate.lights:mirror_ball", calibrate.MirrorBallRequest, FILE_NAME),
+    calibration_jobs.LightPositionsJob: _product("service.calibrate.lights:light_positions", calibrate.LightPositionsRequest, FILE_NAME),
+    calibration_jobs.GreyBallJob: _product("service.calibrate.lights:grey_ball", calibrate.GreyBallRequest, FILE_NAME),
+    calibration_jobs.IntensityJob: _product("service.calibrate.lights:intensity", calibrate.IntensityRequest, FILE_NAME),
+    calibration_jobs.DarkJob: _product("service.calibrate.sensor:dark", calibrate.DarkRequest, FILE_NAME),
+    calibration_jobs.FlatFieldJob: _product("service.calibrate.sensor:flat_field", calibrate.FlatFieldRequest, FILE_NAME),
+    calibration_jobs.SaturationJob: _product("service.calibrate.sensor:saturation", calibrate.SaturationRequest, FILE_NAME, write=True),
+    calibration_jobs.WhiteBalanceJob: _product("service.calibrate.sensor:white_balance", calibrate.WhiteBalanceRequest, FILE_NAME),
+    calibration_jobs.ResponseJob: _product("service.calibrate.response:response", calibrate.ResponseRequest, FILE_NAME),
+    calibration_jobs.ChartJob: _product("service.calibrate.chart:calibrate_chart", ChartRequest, FILE_NAME),
+    calibration_jobs.RigCalibrationJob: _product("service.calibrate.rig_lamps:calibrate_rig", RigCalibrationRequest, MEASURED_FILE),
+    calibration_jobs.ProcamJob: _rig("service.calibrate.procam:procam", calibrate.ProcamRequest),
+    calibration_jobs.StereoCalibrationJob: _rig("service.calibrate.stereo:stereo", calibrate.StereoRequest),
+    calibration_jobs.LaserPlanesJob: _rig("service.calibrate.laser_planes:laser_planes", calibrate.LaserPlanesRequest),
+    calibration_jobs.TofCalibrationJob: _calibrate_tof, jobs.BasisJob: _basis, jobs.PatternsJob: _patterns,
+    jobs.ScanJob: _product("service.depth.scan:scan", ScanRequest, capture_as="scan"),
+    jobs.SeparateJob: _product("service.depth.separate:separate", SeparateRequest)}
+"""The functions of the kinds of jobs whose step is MEASURE."""
 ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] = {
-    calibration_jobs.MirrorBallJob: (MEASURE, _product("service.calibrate.lights:mirror_ball", calibrate.MirrorBallRequest, FILE_NAME)),
-    calibration_jobs.LightPositionsJob: (MEASURE, _product("service.calibrate.lights:light_positions", calibrate.LightPositionsRequest,
-                                                           FILE_NAME)),
-    calibration_jobs.GreyBallJob: (MEASURE, _product("service.calibrate.lights:grey_ball", calibrate.GreyBallRequest, FILE_NAME)),
-    calibration_jobs.IntensityJob: (MEASURE, _product("service.calibrate.lights:intensity", calibrate.IntensityRequest, FILE_NAME)),
-    calibration_jobs.DarkJob: (MEASURE, _product("service.calibrate.sensor:dark", calibrate.DarkRequest, FILE_NAME)),
-    calibration_jobs.FlatFieldJob: (MEASURE, _product("service.calibrate.sensor:flat_field", calibrate.FlatFieldRequest, FILE_NAME)),
-    calibration_jobs.SaturationJob: (MEASURE, _product("service.calibrate.sensor:saturation", calibrate.SaturationRequest, FILE_NAME,
-                                                       write=True)),
-    calibration_jobs.WhiteBalanceJob: (MEASURE, _product("service.calibrate.sensor:white_balance", calibrate.WhiteBalanceRequest,
-                                                         FILE_NAME)),
-    calibration_jobs.ResponseJob: (MEASURE, _product("service.calibrate.response:response", calibrate.ResponseRequest, FILE_NAME)),
-    **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
-    calibration_jobs.RigCalibrationJob: (MEASURE, _product("service.calibrate.rig_lamps:calibrate_rig", RigCalibrationRequest,
-                                                           MEASURED_FILE)),
-    calibration_jobs.ChartJob: (MEASURE, _product("service.calibrate.chart:calibrate_chart", ChartRequest, FILE_NAME)),
+    **{kind: (MEASURE, do) for kind, do in MEASURED.items()},
     jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _product("service.joining.join:join", JoinRequest)),
     jobs.ShadeJob: ("shade", _product("service.relight.shade:shade", ShadeRequest, layout.PICTURE)), jobs.ViewJob: ("view", _view),
     jobs.InspectBoardJob: ("inspect", _product("service.boards.inspect_board:inspect_board", InspectBoardRequest, capture_as="board")),
-    jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _product("service.drive.drive:drive", DriveRequest)),
-    jobs.BasisJob: (MEASURE, _basis), jobs.PatternsJob: (MEASURE, _patterns),
-    jobs.ScanJob: (MEASURE, _product("service.depth.scan:scan", ScanRequest, capture_as="scan")),
-    jobs.SeparateJob: (MEASURE, _product("service.depth.separate:separate", SeparateRequest))}
+    jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _product("service.drive.drive:drive", DriveRequest))}
 """The name of the step of each of these kinds of jobs, and the function that does it."""

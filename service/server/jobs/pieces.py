@@ -7,13 +7,16 @@ both do it, and store the same. The files are deleted when the job ends, and wha
 """
 
 import secrets
+import time
+from collections.abc import Callable
 
 from service.errors import DivergedError
 from service.requests.states import RUNNING
 from service.server.base.log import logger
 from service.server.database import jobs, workers
+from service.server.database.engine import UNANSWERED
 from service.server.jobs.context import Job, WorkerContext
-from service.server.jobs.progress import Stopped
+from service.server.jobs.progress import EVERY_S, UNANSWERED_S, Stopped
 from service.server.storage import layout
 from stage.errors import StorageError
 from stage.files import replacing
@@ -26,6 +29,32 @@ CLAIM = ".claim"
 """Suffix of the files that say who does a piece."""
 
 
+class HelpProgress:
+    """A Progress that ends the help when the job is not running any more or this worker is asked to end; nothing is recorded."""
+
+    def __init__(self, context: WorkerContext, job: Job, *, alive: Callable[[], None], ending: Callable[[], bool]) -> None:
+        self._context, self._job, self._alive, self._ending = context, job, alive, ending
+        self._look_at = 0.0
+
+    def stage(self, name: str, total: int) -> None:
+        """Begin a stage."""
+        self.advance(0)
+
+    def advance(self, done: int) -> None:
+        """Look whether the help is still wanted, at most every EVERY_S; raise Stopped if it is not."""
+        self._alive()
+        now = time.monotonic()
+        if now < self._look_at:
+            return
+        try:
+            wanted = is_running(self._context, self._job) and not self._ending()
+            self._look_at = now + EVERY_S
+        except UNANSWERED:
+            wanted, self._look_at = True, now + UNANSWERED_S
+        if not wanted:
+            raise Stopped
+
+
 class JobPieces:
     """The pieces of one job, for one worker."""
 
@@ -35,11 +64,11 @@ class JobPieces:
 
     def read(self, name: str) -> bytes | None:
         """Return what a worker has stored under a name, or None."""
-        file = self._context.storage.open(self._prefix, name)
-        try:
-            return None if file is None else file.read_bytes()
-        except FileNotFoundError:  # the job has ended meanwhile
+        opened = self._context.storage.open(self._prefix, name)
+        if opened is None:
             return None
+        with open(opened.descriptor, "rb") as file:
+            return file.read()
 
     def write(self, name: str, content: bytes) -> None:
         """Store something under a name, whole or not at all; raise Stopped, and leave nothing, if the job has ended."""

@@ -76,20 +76,17 @@ class JobProgress:
             if self._stopped:
                 raise Stopped
             self._counted = 0 if self._opening else done
-            now = time.monotonic()
-            further = self._stage == FRAMES and self._reached is not None and self._offset + self._counted > self._reached
+            made, now = self._offset + self._counted, time.monotonic()
+            further = self._stage == FRAMES and self._reached is not None and made > self._reached
             if now < self._record_at and not further:
                 return
             self.guard()
-            spent = now - self._began
-            counted = self._counted
-            rate = counted / spent if counted and spent > 0 else None
-            made = self._offset + counted
-            progress = jobs.StageProgress(self._stage, max(made, self._shown) if self._stage == FRAMES else made, self._total, rate)
+            rate = self._counted / (now - self._began) if self._counted and now > self._began else None
+            shown = max(made, self._shown) if self._stage == FRAMES else made
             try:
-                self._stopped = not jobs.advance(self._database, self._claim, progress, frames=made, repeating=self._repeating,
-                                                 begun=self._begun if self._new_stage else None,
-                                                 entered=self._stage != self._logged)
+                self._stopped = not jobs.advance(
+                    self._database, self._claim, self._stage, shown, self._total, rate, frames=made, repeating=self._repeating,
+                    begun=self._begun if self._new_stage else None, entered=self._stage != self._logged)
                 self._logged = self._stage
                 self._record_at = time.monotonic() + EVERY_S
                 self._new_stage = False

@@ -1,17 +1,16 @@
 """The workflow of a job: its steps, one after the other.
 
 DBOS starts the workflow, and starts it again from its beginning when the job goes to another worker. Steps that the same version of relit
-has finished are then skipped: `finished_steps` in service.server.database.tables says why that list is ours. So no step is a step of
-DBOS, which would record it a second time, under the name of a Python function.
+has finished are then skipped: `finished_steps` in service.server.database.tables says why that list is ours.
 """
 
 import re
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from contextlib import nullcontext
-from typing import TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any, TypeVar
 
 from dbos import DBOS
 
@@ -25,13 +24,11 @@ from service.server.base.log import logger
 from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
-from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.helping import HelpProgress, help_with
-from service.server.jobs.pieces import JobPieces
-from service.server.jobs.places import without_places
+from service.server.jobs.context import Job, JobStep, WorkerContext, without_places
+from service.server.jobs.pieces import HelpProgress, JobPieces
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
-from service.server.jobs.steps import steps_of
+from service.server.jobs.steps import help_with, steps_of
 from service.server.storage import layout
 from stage.errors import StorageError
 
@@ -79,38 +76,25 @@ class JobRunner:
         """Do a job and return its outcome: DONE, STOPPED, or the state in which it ended."""
         if self._draining.is_set():
             _wait_for_the_end()
-        workflow = workflow_id(claim.job, claim.attempt)
-        with self._changed:
-            self._running.add(workflow)
-        try:
-            return self._run(claim)
-        finally:
-            self._forget(claim)
-            with self._changed:
-                self._running.discard(workflow)
+        with self._runs(workflow_id(claim.job, claim.attempt)):
+            try:
+                return self._run(claim)
+            finally:
+                self._forget(claim)
 
     def help(self, workflow: str) -> None:
         """Help the worker that has a job until nothing is left to help with; what goes wrong here is of no concern to the job."""
         claim = Claim(*job_and_attempt(workflow), self._worker)
         log = logger.bind(job=claim.job, attempt=claim.attempt, worker=self._worker)
-        self._sign(claim)
-        with self._changed:
-            self._running.add(workflow)
-        try:
-            row = jobs.find(self._context.database, claim.job)
-            if row is not None and row["attempt"] == claim.attempt and row["worker"] != self._worker:
-                self._help(Job.of(row), claim)
-        except Exception as error:
-            log.warning("help failed", error=repr(error), trace=traceback.format_exc())
-        finally:
-            with self._changed:
-                self._running.discard(workflow)
-                del self._signs[claim]
-                self._alive(min(self._signs.values(), default=0.0))
-                self._changed.notify_all()
+        with self._runs(workflow), self._signs_of(claim):
+            try:
+                row = jobs.find(self._context.database, claim.job)
+                if row is not None and row["attempt"] == claim.attempt and row["worker"] != self._worker:
+                    self._help(Job.of(row), claim, log)
+            except Exception as error:
+                log.warning("help failed", error=repr(error), trace=traceback.format_exc())
 
-    def _help(self, job: Job, claim: Claim) -> None:
-        log = logger.bind(job=job.id, attempt=job.attempt, worker=self._worker)
+    def _help(self, job: Job, claim: Claim, log: Any) -> None:
         log.info("help begins")
         progress = HelpProgress(self._context, job, alive=lambda: self._sign(claim), ending=self._draining.is_set)
         try:
@@ -173,14 +157,8 @@ class JobRunner:
     def _step(self, claim: Claim, name: str) -> str:
         if self._draining.is_set():
             _wait_for_the_end()
-        self._sign(claim)
-        try:
+        with self._signs_of(claim):
             return self._patiently(claim, lambda: self._perform(claim, name))
-        finally:
-            with self._changed:
-                del self._signs[claim]
-                self._alive(min(self._signs.values(), default=0.0))
-                self._changed.notify_all()
 
     def _perform(self, claim: Claim, name: str) -> str:
         database = self._context.database
@@ -300,6 +278,29 @@ class JobRunner:
             with self._changed:
                 if claim in self._signs:
                     self._sign(claim)
+
+    @contextmanager
+    def _runs(self, workflow: str) -> Iterator[None]:
+        """Let a workflow count as one that runs in this process."""
+        with self._changed:
+            self._running.add(workflow)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._running.discard(workflow)
+
+    @contextmanager
+    def _signs_of(self, claim: Claim) -> Iterator[None]:
+        """Give a sign of a step that runs, and at its end that of the other steps."""
+        self._sign(claim)
+        try:
+            yield
+        finally:
+            with self._changed:
+                del self._signs[claim]
+                self._alive(min(self._signs.values(), default=0.0))
+                self._changed.notify_all()
 
     def _sign(self, claim: Claim) -> None:
         with self._changed:

@@ -5,7 +5,6 @@ would stop the supervisor for ever. Each sign is one aligned double.
 """
 
 import multiprocessing
-import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
@@ -13,6 +12,7 @@ from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
 from service.server.base.log import logger
+from service.server.base.rounds import Rounds
 from service.server.base.settings import Settings
 
 LOOK_S = 0.5
@@ -67,30 +67,24 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
 class _Slot:
     device: str
     process: SpawnProcess | None = None
-    heartbeat: Heartbeat | None = None
+    heartbeat: Heartbeat = field(default_factory=Heartbeat)
     failures: int = 0
     """Starts in a row after which the worker died before it was ready."""
     start_at: float = field(default_factory=time.monotonic)
 
 
-class Supervisor:
+class Supervisor(Rounds):
     """Starts and watches one worker process for each device."""
 
     def __init__(self, settings: Settings, devices: list[str]) -> None:
+        super().__init__("relit-supervisor", LOOK_S, self._round)
         self._settings = settings
         self._spawn = multiprocessing.get_context("spawn")  # a forked process cannot use CUDA
         self._slots = [_Slot(device) for device in devices]
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relit-supervisor", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread that starts and watches the workers."""
-        self._thread.start()
 
     def stop(self) -> None:
         """Ask the workers to finish their steps, and wait until they end."""
-        self._ended.set()
-        self._thread.join()
+        super().stop()
         running = [slot.process for slot in self._slots if slot.process is not None and slot.process.is_alive()]
         for process in running:
             process.terminate()
@@ -107,26 +101,23 @@ class Supervisor:
             if (process := slot.process) is not None:
                 process.kill()
 
-    def _run(self) -> None:
-        while not self._ended.is_set():
-            for slot in self._slots:
-                try:
-                    self._look(slot)
-                except OSError as error:  # there is no memory or no process left; at the next look there may be
-                    logger.error("worker cannot be started", device=slot.device, error=str(error))
-            self._ended.wait(LOOK_S)
+    def _round(self) -> None:
+        for slot in self._slots:
+            try:
+                self._look(slot)
+            except OSError as error:  # there is no memory or no process left; at the next look there may be
+                logger.error("worker cannot be started", device=slot.device, error=str(error))
 
     def _look(self, slot: _Slot) -> None:
         now = time.monotonic()
         if slot.process is None:
             if now >= slot.start_at:
-                heartbeat = Heartbeat()
-                process = self._spawn.Process(target=run_worker, args=(self._settings, slot.device, heartbeat),
+                slot.heartbeat = Heartbeat()
+                process = self._spawn.Process(target=run_worker, args=(self._settings, slot.device, slot.heartbeat),
                                               name=f"relit-worker-{slot.device}")
                 process.start()
-                slot.process, slot.heartbeat = process, heartbeat
+                slot.process = process
             return
-        assert slot.heartbeat is not None, "it has been started"
         if not slot.process.is_alive():
             slot.failures = 0 if slot.heartbeat.was_ready else slot.failures + 1
             pause = PAUSES_S[min(slot.failures, len(PAUSES_S) - 1)]

@@ -1,22 +1,36 @@
 """Takeover: the jobs of a worker that died go back to the queue.
 
-DBOS gives a worker's jobs back only to a worker of the same name. So each worker holds a lock that is named after it (worker_lock), and
-looks every few seconds whether a worker that has jobs has lost its lock. The worker that finds one holds that lock meanwhile, so that no
-two take over the same jobs.
+DBOS gives a worker's jobs back only to a worker of the same name. So each worker holds a lock that is named after it, and looks every few
+seconds whether a worker that has jobs has lost its lock. On SQLite, where all workers are on one machine, it is a lock on a file, which the
+operating system releases; on PostgreSQL an advisory lock of a session, which the server releases. A worker that takes over from a dead one
+holds that one's lock meanwhile, so that no two take over the same jobs. Names of workers are never used again.
 """
 
-import threading
+import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from enum import Enum
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
+
+import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.requests.states import QUEUED
+from service.server.base import file_lock
 from service.server.base.log import logger
+from service.server.base.rounds import Rounds
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import Claim
 from service.server.jobs.queue import JobQueue, is_help, job_and_attempt
-from service.server.jobs.worker_lock import LockState, WorkerLock
 
+SPACE = 7
+"""Seed of the hash of names, so that these advisory locks do not coincide with those of other programs."""
+KEEPALIVE = {"tcp_keepalives_idle": 3, "tcp_keepalives_interval": 1, "tcp_keepalives_count": 3}
+"""Seconds and tries after which the server ends the session of a machine that is gone; its own default is hours."""
 GRACE_ROUNDS = 2
 """Rounds without a takeover after this worker had to take its lock again: a restart of the database released the locks of all other workers
 as well, and they need time to take them again."""
@@ -25,7 +39,123 @@ FORGOTTEN_ROUNDS = 3
 stops after it has assigned the workflow and before this worker receives the answer."""
 
 
-class Takeover:
+class LockState(Enum):
+    """Results of `WorkerLock.hold`."""
+
+    KEPT = "kept"
+    TAKEN = "taken"
+    """The lock was not held before, or had been lost."""
+    REFUSED = "refused"
+    """Another process has the lock."""
+
+
+WorkerLock: TypeAlias = "FileWorkerLock | AdvisoryWorkerLock"
+"""The lock of this worker, and a look at those of others."""
+
+
+class FileWorkerLock:
+    """Locks on the files of a folder."""
+
+    def __init__(self, folder: Path, worker: str) -> None:
+        self._folder, self._worker = folder, worker
+        self._file: int | None = None
+
+    def hold(self) -> LockState:
+        """Take or keep the lock, which other processes see as long as the file has its name."""
+        if self._file is not None:
+            if file_lock.is_named(self._file, self._path(self._worker)):
+                return LockState.KEPT
+            os.close(self._file)
+        self._file = self._take(self._worker)
+        return LockState.REFUSED if self._file is None else LockState.TAKEN
+
+    @contextmanager
+    def dead(self, worker: str) -> Iterator[bool]:
+        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
+        file = self._take(worker)
+        try:
+            yield file is not None
+        finally:
+            if file is not None:
+                self._drop(file, worker)
+
+    def close(self) -> None:
+        """Release the lock."""
+        if self._file is not None:
+            self._drop(self._file, self._worker)
+            self._file = None
+
+    def _take(self, worker: str) -> int | None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return file_lock.take(self._path(worker))
+
+    def _drop(self, file: int, worker: str) -> None:
+        self._path(worker).unlink(missing_ok=True)
+        os.close(file)
+
+    def _path(self, worker: str) -> Path:
+        return self._folder / f"{worker.replace('/', '_')}.lock"
+
+
+class AdvisoryWorkerLock:
+    """Advisory locks of one PostgreSQL session."""
+
+    def __init__(self, database: Database, worker: str) -> None:
+        self._engine, self._worker = database.engine, worker
+        self._session: sa.Connection | None = None
+
+    def hold(self) -> LockState:
+        """Take or keep the lock; after a restart of the server it is taken in a new session."""
+        if self._session is not None:
+            try:
+                self._session.execute(sa.text("SELECT 1"))
+            except SQLAlchemyError:  # one that broke in a look at another worker, too, which then waits to be rolled back
+                self.close()
+            else:
+                return LockState.KEPT
+        session = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        try:
+            for name, value in KEEPALIVE.items():
+                session.execute(sa.text(f"SET {name} = {value}"))
+            if self._take(session, self._worker):
+                self._session = session
+                return LockState.TAKEN
+            return LockState.REFUSED
+        finally:
+            if self._session is None:
+                session.close()
+
+    @contextmanager
+    def dead(self, worker: str) -> Iterator[bool]:
+        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
+        session = self._session
+        assert session is not None, "hold the lock of this worker first"
+        taken = self._take(session, worker)
+        try:
+            yield taken
+        finally:
+            if taken:
+                with suppress(SQLAlchemyError):  # a session that has ended holds nothing
+                    session.execute(sa.text("SELECT pg_advisory_unlock(hashtextextended(:name, :space))"), {"name": worker, "space": SPACE})
+
+    def close(self) -> None:
+        """End the session, which releases the lock."""
+        if self._session is not None:
+            self._session.invalidate()
+            self._session.close()
+            self._session = None
+
+    def _take(self, session: sa.Connection, worker: str) -> bool:
+        return bool(session.execute(sa.text("SELECT pg_try_advisory_lock(hashtextextended(:name, :space))"),
+                                    {"name": worker, "space": SPACE}).scalar())
+
+
+def open_worker_lock(database: Database, locks: Path, worker: str) -> WorkerLock:
+    """Return the lock of a worker: a file in `locks` with SQLite, else an advisory lock of PostgreSQL."""
+    return FileWorkerLock(locks, worker) if database.is_sqlite else AdvisoryWorkerLock(database, worker)
+
+
+class Takeover(Rounds):
     """A thread that keeps the worker's own lock and takes over from workers that died."""
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
@@ -38,23 +168,13 @@ class Takeover:
         `asked` is called with what an operator asks of this worker, each round.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
-        self._every_s, self._max_lost = every_s, max_lost
+        super().__init__("relit-takeover", every_s, self._guarded_round)
+        self._max_lost = max_lost
         self._running, self._beat, self._lock_lost, self._asked = running, beat, lock_lost, asked
         self.state = workers.READY
         """State of this worker for the table of workers."""
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relit-takeover", daemon=True)
         self._grace = self._refused = 0
         self._unknown: Counter[str] = Counter()
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread and wait for it."""
-        self._ended.set()
-        self._thread.join()
 
     def round(self) -> None:
         """Renew the lock, then look at the other workers once."""
@@ -66,8 +186,7 @@ class Takeover:
             return
         if held is LockState.TAKEN:
             self._grace = GRACE_ROUNDS
-        workers.record_alive(self._database, self._worker, self.state)
-        if (what := workers.asked_of(self._database, self._worker)) is not None:
+        if (what := workers.record_alive(self._database, self._worker, self.state)) is not None:
             self._asked(what)
         taken = self._queue.taken_by()
         self._return_forgotten(taken.pop(self._worker, []))
@@ -79,34 +198,27 @@ class Takeover:
                 if dead:
                     self._take_over(worker)
 
-    def _run(self) -> None:
-        while True:
-            self._beat()
-            try:
-                self.round()
-            except UNANSWERED as error:
-                logger.warning("database does not answer", error=message_of(error))
-            except Exception as error:  # the next round may succeed; a worker without rounds would seem dead
-                logger.error("takeover failed", exc_info=error)
-            if self._ended.wait(self._every_s):
-                return
+    def _guarded_round(self) -> None:
+        self._beat()
+        try:
+            self.round()
+        except UNANSWERED as error:
+            logger.warning("database does not answer", error=message_of(error))
+        except Exception as error:  # the next round may succeed; a worker without rounds would seem dead
+            logger.error("takeover failed", exc_info=error)
 
     def _take_over(self, worker: str) -> None:
+        """Queue the workflows of a dead worker again, or end those of its jobs that have lost too many workers."""
         workflows = self._queue.taken_by().get(worker, [])  # read again under the worker's lock: another may have been faster
         if workflows:
             logger.warning("worker died", dead=worker, jobs=[job_and_attempt(workflow)[0] for workflow in workflows])
         for workflow in workflows:
-            self._take(workflow, worker)
+            record = partial(jobs.record_lost_worker, claim=Claim(*job_and_attempt(workflow), worker), limit=self._max_lost)
+            if not is_help(workflow) and self._database.transact(record) == QUEUED:
+                self._queue.requeue(workflow)
+            else:  # also of help, as the worker that has the job does what is left
+                self._queue.cancel(workflow)
         workers.remove(self._database, worker)
-
-    def _take(self, workflow: str, worker: str) -> None:
-        """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
-        claim = Claim(*job_and_attempt(workflow), worker)
-        if not is_help(workflow) and self._database.transact(
-                lambda connection: jobs.record_lost_worker(connection, claim, self._max_lost)) == QUEUED:
-            self._queue.requeue(workflow)
-        else:  # also of help, as the worker that has the job does what is left
-            self._queue.cancel(workflow)
 
     def _return_forgotten(self, workflows: list[str]) -> None:
         unknown = set(workflows) - self._running()

@@ -19,8 +19,7 @@ from service.server.jobs.context import WorkerContext
 from service.server.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
 from service.server.jobs.runner import JobRunner
 from service.server.jobs.supervisor import Heartbeat
-from service.server.jobs.takeover import Takeover
-from service.server.jobs.worker_lock import LockState, open_worker_lock
+from service.server.jobs.takeover import Takeover, open_worker_lock
 from service.server.storage.objects import open_storage
 
 POLL_S = 0.5
@@ -46,8 +45,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     host = socket.gethostname()
     name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
     lock = open_worker_lock(database, settings.locks, name)
-    if lock.hold() is LockState.REFUSED:
-        raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
+    lock.hold()  # nobody else has one of this name, which is random
     queue = JobQueue(database)
     context = WorkerContext(settings, database, open_storage(settings), queue, device, name)
     runner = JobRunner(context, name, alive=heartbeat.step)

@@ -9,7 +9,6 @@ from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -65,6 +64,8 @@ NEXT_STEPS: dict[str, tuple[str, ...]] = {
     "light": ("pipeline", "solve"), "pattern": ("depth", "separate"), "laser": ("depth",), "tof": ("depth",), "stereo": ("depth",),
     "shots": ("scan",), "tiles": ("inspect-board",)}
 """What a capture is made for, by what it holds: jobs that need nothing but the capture. A capture that can be relit is lit first."""
+BOUNDS = {"ge": "low", "gt": "low", "le": "high", "lt": "high"}
+"""The end of a range that a constraint of a number bounds, by the name of its value in annotated_types."""
 UNITS = {"px": "pixels", "m": "metres", "s": "seconds", "hz": "Hz", "deg": "degrees", "degrees": "degrees", "c": "°C"}
 """Units in words, by what ends the name of a field in them."""
 WORDS = {"color_space": "Colour space", "focal_px": "Focal length (pixels)", "principal_px": "Principal point (pixels)",
@@ -137,7 +138,8 @@ def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Fi
     control, value_type, choices = _control(option)
     default = option.field.default
     shown = "" if option.field.is_required() or default in (None, ()) or isinstance(default, bool) else typed(default)
-    limits = {kind: f"{value:g}" for limit in option.constraints for kind, value in _limits(limit)}
+    limits = {end: f"{value:g}" for limit in option.constraints for name, end in BOUNDS.items()
+              if (value := getattr(limit, name, None)) is not None}
     label = _label(paths[0].rpartition(".")[2])
     return Field(option.name, paths, label, help_text(option, model), control, value_type, option.flag, option.off,
                  option.spelling.argument, choices, "true" if default is True else shown, option.field.is_required(),
@@ -184,8 +186,3 @@ def _examples(option: Option) -> list[Any]:
 
 def _bare(kind: Any) -> Any:
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
-
-
-def _limits(limit: Any) -> list[tuple[str, float]]:
-    names = {"ge": "low", "gt": "low", "le": "high", "lt": "high"} if isinstance(limit, Ge | Gt | Le | Lt) else {}
-    return [(place, float(value)) for name, place in names.items() if (value := getattr(limit, name, None)) is not None]

@@ -36,7 +36,7 @@ from service.server.storage import layout
 from service.server.storage.bucket import Bucket, Object
 from service.server.storage.folder import REMOVED, is_shown
 from service.server.storage.objects import TRANSFERS
-from service.server.storage.part_files import part_files_folder
+from service.server.storage.upload_parts import part_files_folder
 from stage.errors import StorageError, storage
 from stage.files import write_text
 
@@ -99,12 +99,6 @@ class Backup(NamedTuple):
     """True if copies of the objects are among the files."""
     differing: int = 0
     """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
-
-
-class _Contents(NamedTuple):
-    files: dict[str, dict[str, Any]]
-    storage: dict[str, Any] | None
-    """The store of a service with storage_url: its URL, whether the objects are copied, and the objects; None without storage_url."""
 
 
 def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
@@ -244,12 +238,13 @@ def _postgres(settings: Settings, program: str, *arguments: str) -> None:
         raise RequestError(f"{program}: {' '.join(done.stderr.split())[:500]}")
 
 
-def _contents(folder: Path) -> _Contents:
+def _contents(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
+    """Return the files of a backup, and of the store of a service with storage_url its URL, its objects and whether these are copied."""
     path = folder / CONTENTS
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         files, stored = found["files"], found.get("storage")
-        assert found["schema"] == SCHEMA
+        assert found["schema"] == SCHEMA and isinstance(files, dict)
         if stored is not None:
             assert isinstance(stored["url"], str)
             copied = {f"{OBJECTS}/{path}" for path, entry in stored["objects"].items() if isinstance(entry["version"], str)}
@@ -261,7 +256,7 @@ def _contents(folder: Path) -> _Contents:
     for name in files:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise RequestError(f"{path}: {name} leads out of the backup")
-    return _Contents(dict(files), stored)
+    return files, stored
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -4,13 +4,11 @@ That process imports this module, which therefore imports nothing of the API.
 """
 
 import multiprocessing
-from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from service.server.base.settings import Settings
 
-T = TypeVar("T")
 CPU = "cpu"
 """The device that every machine has: no process needs to look for it."""
 
@@ -23,39 +21,26 @@ def of_workers(settings: "Settings") -> list[str]:
         return []
     if settings.devices:
         return [resolve(device) for device in settings.devices]
-    names, outdated = _elsewhere(_names)
-    _warn(outdated)
-    return [name for name in names if name.startswith("cuda")] or [CPU]
+    return [name for name in _elsewhere("names") if name.startswith("cuda")] or [CPU]
 
 
 def resolve(device: str | None) -> str:
     """Return the name of a device of this machine; None: of the best. Raise DeviceError if it is not on this machine."""
-    if device == CPU:
-        return device
-    name, outdated = _elsewhere(_resolve, device)
-    _warn(outdated)
-    return name
+    return device if device == CPU else _elsewhere("resolve", device)
 
 
-def _warn(outdated: str | None) -> None:
+def _elsewhere(function: str, *arguments: object) -> Any:
+    """Call a function of kernels.device in another process, and log what it says of a driver that is too old."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        answer, outdated = pool.apply(_ask, (function, arguments))
     if outdated is not None:
         from service.server.base.log import logger
 
         logger.warning(outdated)
+    return answer
 
 
-def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(ask, arguments)
+def _ask(function: str, arguments: tuple[object, ...]) -> tuple[Any, str | None]:
+    from kernels import device
 
-
-def _names() -> tuple[list[str], str | None]:
-    from kernels.device import names, outdated_driver
-
-    return names(), outdated_driver()
-
-
-def _resolve(device: str | None) -> tuple[str, str | None]:
-    from kernels.device import outdated_driver, resolve
-
-    return resolve(device), outdated_driver()
+    return getattr(device, function)(*arguments), device.outdated_driver()

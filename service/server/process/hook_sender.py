@@ -20,6 +20,7 @@ import sqlalchemy as sa
 from service import __version__
 from service.server.base import outgoing
 from service.server.base.log import logger
+from service.server.base.rounds import Rounds
 from service.server.base.settings import Settings
 from service.server.database import hooks, jobs
 from service.server.database.engine import UNANSWERED, Database, message_of
@@ -38,26 +39,19 @@ CLOSE_S = 1.0
 """Seconds that the requests under way get when the service ends; another try follows when it runs again."""
 
 
-class HookSender:
+class HookSender(Rounds):
     """Sends deliveries that are due, in threads; several services with one database share the work."""
 
     def __init__(self, settings: Settings, database: Database, *, clock: Callable[[], float] = time.time) -> None:
+        super().__init__("relit-hooks", EVERY_S, self._guarded_round)
         self._networks, self._database, self._clock = settings.hook_networks, database, clock
         self._busy: dict[str, tuple[str, threading.Thread]] = {}  # project and thread, by hook
         self._lock = threading.Lock()
         self._told = ""  # the last error, which is logged once
-        self._wake, self._ended = threading.Event(), False
-        self._thread = threading.Thread(target=self._run, name="relit-hooks", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread that looks for deliveries."""
-        self._thread.start()
 
     def stop(self) -> None:
         """Begin no further try, and wait a moment for those under way."""
-        self._ended = True
-        self._wake.set()
-        self._thread.join()
+        super().stop()
         self.wait(CLOSE_S)
 
     def wait(self, timeout_s: float | None = None) -> None:
@@ -83,18 +77,15 @@ class HookSender:
                     thread.start()
                     self._busy[row["id"]] = row["project"], thread
 
-    def _run(self) -> None:
-        while not self._ended:
-            try:
-                self.round()
-                self._told = ""
-            except Exception as error:  # of the database, which may answer later, or of relit itself
-                if (told := message_of(error)) != self._told:
-                    known = isinstance(error, UNANSWERED)
-                    logger.warning("hooks wait", error=told, **({} if known else {"trace": traceback.format_exc()}))
-                self._told = told
-            self._wake.wait(EVERY_S)
-            self._wake.clear()
+    def _guarded_round(self) -> None:
+        try:
+            self.round()
+            self._told = ""
+        except Exception as error:  # of the database, which may answer later, or of relit itself
+            if (told := message_of(error)) != self._told:
+                known = isinstance(error, UNANSWERED)
+                logger.warning("hooks wait", error=told, **({} if known else {"trace": traceback.format_exc()}))
+            self._told = told
 
     def _try(self, taken: sa.RowMapping) -> None:
         try:

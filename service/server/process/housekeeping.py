@@ -4,7 +4,6 @@ Captures, environments and jobs that have not ended are never deleted.
 """
 
 import shutil
-import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -14,12 +13,13 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from service.server.base.log import logger
+from service.server.base.rounds import Rounds
 from service.server.base.settings import Settings
 from service.server.database import audit, hooks, idempotency, intakes, jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.tables import clock as clock_table
 from service.server.jobs.queue import JobQueue
-from service.server.jobs.worker_lock import FileWorkerLock
+from service.server.jobs.takeover import FileWorkerLock
 from service.server.storage import layout
 from service.server.storage.folder import drop_folder
 from service.server.storage.objects import Storage
@@ -47,41 +47,25 @@ DOWNTIME_S = 86_400.0
 """Seconds for which the service may be away without its clock being doubted: how long it was really away, nobody knows."""
 
 
-class Housekeeper:
+class Housekeeper(Rounds):
     """A thread that does the housekeeping every EVERY_S."""
 
     def __init__(self, settings: Settings, database: Database, storage: Storage, queue: JobQueue, *,
                  clock: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Create the thread; `start` starts it. `clock` is in seconds since 1970, `monotonic` does not jump when the clock is set."""
+        super().__init__("relit-housekeeping", EVERY_S, self.round)
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
         self._watch = ClockWatch(database, now=clock, monotonic=monotonic)
         self._parts = open_upload_parts(settings, database, storage)
         self._silent: set[str] = set()
         self._told: dict[str, str] = {}  # the last error of each piece of work that fails, which is logged once
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relit-housekeeping", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread, which begins with a round."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread after its current piece of work."""
-        self._ended.set()
-        self._thread.join()
 
     def round(self) -> None:
         """Do all pieces of work once; a piece that fails is tried again in the next round."""
         for piece in (self._aged, self._workers, self._caches, self._leftovers, self._interrupted):
-            if self._ended.is_set():
+            if self._ended:
                 return
             self._try(piece.__name__.strip("_"), piece)
-
-    def _run(self) -> None:
-        while True:
-            self.round()
-            if self._ended.wait(EVERY_S):
-                return
 
     def _try(self, piece: str, work: Callable[[], object]) -> None:
         """Do a piece of work. Whatever error it meets, the thread goes on with the next; the same error is logged once."""
@@ -106,12 +90,12 @@ class Housekeeper:
         if self._settings.retention_days is None:
             return
         for row in jobs.ended_before(self._database, self._clock() - self._settings.retention_days * DAY_S):
-            if self._ended.is_set():
+            if self._ended:
                 return
             self._try(row["id"], partial(self._remove_job, row))
 
     def _remove_job(self, row: sa.RowMapping) -> None:
-        if self._database.transact(partial(_forget, job=row["id"])):
+        if self._database.transact(lambda connection: not jobs.users_of(connection, row["id"]) and jobs.remove(connection, row["id"])):
             self._storage.remove(layout.results(row["project"], row["id"]))
             self._storage.remove(layout.shared(row["project"], row["id"]))
             self._queue.forget(row["id"])
@@ -185,10 +169,6 @@ class Housekeeper:
             if path.is_file() and path.stat().st_mtime < self._clock() - UNFINISHED_S:
                 path.unlink(missing_ok=True)
                 logger.info("unfinished stack removed", file=path.name)
-
-
-def _forget(connection: sa.Connection, job: str) -> bool:
-    return not jobs.users_of(connection, job) and jobs.remove(connection, job)
 
 
 def _clear(folder: Path) -> None:

@@ -55,7 +55,8 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     server = http_server(app, settings, limits)
     housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
     sender = HookSender(settings, database)
-    address = _address(settings.host, listening.getsockname()[1])
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    address = f"http://{host}:{listening.getsockname()[1]}"
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
     if set_routes is not None:
@@ -123,7 +124,3 @@ def _listen(settings: Settings) -> socket.socket:
     except OSError as error:  # gaierror too
         why = (error.strerror or "").partition(" (")[0]
         raise RequestError(f"cannot listen on host {settings.host}, port {settings.port}: {why}") from None
-
-
-def _address(host: str, port: int) -> str:
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -6,7 +6,7 @@ The credentials, region and endpoint of S3 come from the usual variables (AWS_AC
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -58,16 +58,16 @@ class Bucket:
 
     def below(self, prefix: str) -> list[Object]:
         """Return all objects whose path begins with the prefix and a /."""
-        with self._told("list", prefix):
-            return _persist(lambda: [_object(meta) for batch in self._api.list(self._store, prefix=f"{prefix}/") for meta in batch])
+        return self._call("list", prefix, lambda: [
+            _object(meta) for batch in self._api.list(self._store, prefix=f"{prefix}/") for meta in batch])
 
     def find(self, path: str) -> Object | None:
         """Return one object; None: there is none."""
         from obstore.exceptions import GenericError
 
-        with self._told("look at", path):
+        def head() -> Object | None:
             try:
-                return _object(_persist(lambda: self._api.head(self._store, path)))
+                return _object(self._api.head(self._store, path))
             except FileNotFoundError:
                 return None
             except GenericError as error:
@@ -75,14 +75,14 @@ class Bucket:
                     return None
                 raise
 
+        return self._call("look at", path, head)
+
     def fetch(self, found: Object, target: Path, moved: Callable[[], None]) -> None:
         """Copy an object, unless it was replaced meanwhile, into a file; `moved` is called after every piece and may raise to end it."""
-
         with storage("write", target), open(target, "wb") as file:
             for begin in range(0, found.size, PIECE_BYTES):
                 end = min(begin + PIECE_BYTES, found.size)
-                with self._told("fetch", found.path):
-                    got = _persist(partial(self._piece, found, begin, end))
+                got = self._call("fetch", found.path, partial(self._piece, found, begin, end))
                 if len(got) != end - begin:
                     raise StorageError(f"cannot fetch {self.url}/{found.path}: {len(got)} bytes came instead of {end - begin}")
                 file.write(got)
@@ -105,8 +105,7 @@ class Bucket:
                 else:
                     self._api.put(self._store, path, _parts(source, part, moved), chunk_size=part, max_concurrency=PARTS_AT_ONCE)
 
-            with self._told("send", path):
-                _persist(put)
+            self._call("send", path, put)
         sent = self.find(path)
         if sent is None or sent.size != size:
             raise StorageError(f"cannot send {self.url}/{path}: it is not there as it was sent")
@@ -114,14 +113,12 @@ class Bucket:
 
     def mark(self, path: str) -> None:
         """Write an empty object."""
-        with self._told("write", path):
-            _persist(lambda: self._api.put(self._store, path, b"", use_multipart=False))
+        self._call("write", path, lambda: self._api.put(self._store, path, b"", use_multipart=False))
 
     def delete(self, paths: list[str]) -> None:
         """Delete objects; some may be gone already."""
         for begin in range(0, len(paths), DELETED_AT_ONCE):
-            with self._told("delete", paths[begin]):
-                _persist(partial(self._delete_all, paths[begin : begin + DELETED_AT_ONCE]))
+            self._call("delete", paths[begin], partial(self._delete_all, paths[begin : begin + DELETED_AT_ONCE]))
 
     def _delete_all(self, paths: list[str]) -> None:
         try:
@@ -133,22 +130,27 @@ class Bucket:
 
     def check(self, path: str) -> None:
         """Write and delete an object, with few retries."""
-        with self._told("write", path):
+        def probe() -> None:
             self._api.put(self._probe, path, b"relit", use_multipart=False)
             with suppress(FileNotFoundError):
                 self._api.delete(self._probe, path)
 
-    @contextmanager
-    def _told(self, action: str, path: str) -> Iterator[None]:
-        """Turn an exception of obstore into a StorageError of one sentence."""
-        from obstore.exceptions import BaseError
+        self._call("write", path, probe, within_s=0.0)
 
-        try:
-            yield
-        except (StorageError, FileNotFoundError):
-            raise
-        except (BaseError, OSError, ValueError) as error:
-            raise StorageError(f"cannot {action} {self.url}/{path}: {_reason(error)}") from error
+    def _call(self, action: str, path: str, ask: Callable[[], T], within_s: float = RETRY_S) -> T:
+        """Call obstore, and again after errors of the connection that it does not retry; other exceptions become one sentence."""
+        from obstore.exceptions import BaseError, GenericError
+
+        until = time.monotonic() + within_s
+        while True:
+            try:
+                return ask()
+            except (StorageError, FileNotFoundError):
+                raise
+            except (BaseError, OSError, ValueError) as error:
+                if not isinstance(error, GenericError) or BROKEN not in str(error) or time.monotonic() > until:
+                    raise StorageError(f"cannot {action} {self.url}/{path}: {_reason(error)}") from error
+            time.sleep(AGAIN_S)
 
 
 def _store(url: str, *, retries: int, retry_s: int, request_s: int) -> Any:
@@ -187,20 +189,6 @@ def _parts(source: Any, size: int, moved: Callable[[], None]) -> Iterator[bytes]
     while part := source.read(size):
         yield part
         moved()
-
-
-def _persist(action: Callable[[], T]) -> T:
-    """Call obstore, and again after errors of the connection that it does not retry; within the time that it retries others."""
-    from obstore.exceptions import GenericError
-
-    until = time.monotonic() + RETRY_S
-    while True:
-        try:
-            return action()
-        except GenericError as error:
-            if BROKEN not in str(error) or time.monotonic() > until:
-                raise
-        time.sleep(AGAIN_S)
 
 
 def _reason(error: Exception) -> str:

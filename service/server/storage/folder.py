@@ -30,11 +30,19 @@ class StoredFile(NamedTuple):
 class OpenFile(NamedTuple):
     """An open file of the storage, which whoever gets it closes. Its bytes are those of its version, whatever replaces it."""
 
+    name: str
     descriptor: int
     size: int
     modified_at: float
     version: str
     """The same from every machine as long as the content is the same: letters, digits and hyphens."""
+
+    @classmethod
+    def of(cls, name: str, descriptor: int) -> "OpenFile":
+        """Describe an open file of this machine; its version is that of its inode, which is never written to again."""
+        status = os.fstat(descriptor)
+        version = f"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"
+        return cls(name, descriptor, status.st_size, status.st_mtime, version)
 
 
 class FolderStorage:
@@ -86,23 +94,16 @@ class FolderStorage:
         """Return all complete files of a prefix, by name."""
         return sorted(stored_below(self._root / prefix))
 
-    def open(self, prefix: str, name: str) -> Path | None:
-        """Return the path of a file; None: there is none, or a link leads to it."""
+    def open(self, prefix: str, name: str) -> OpenFile | None:
+        """Open a file; None: there is none, or a link leads to it."""
         folder = self._root / prefix
         path = folder / name
-        return path if is_shown(name) and path.is_file() and path.resolve() == folder.resolve() / name else None  # not through a link
-
-    def open_file(self, prefix: str, name: str) -> OpenFile | None:
-        """Open one file; its version is that of its inode, which is never written to again."""
-        path = self.open(prefix, name)
-        if path is None:
+        if not is_shown(name) or not path.is_file() or path.resolve() != folder.resolve() / name:
             return None
         try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+            return OpenFile.of(name, os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
         except FileNotFoundError:  # deleted meanwhile
             return None
-        status = os.fstat(descriptor)
-        return OpenFile(descriptor, status.st_size, status.st_mtime, f"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}")
 
     def remove(self, prefix: str) -> None:
         """Delete the folder, if there is one; it is hidden first, so that a part of it is not shown. A mark stays for REMEMBERED_S."""

@@ -32,8 +32,16 @@ from service.server.storage.folder import (
 from stage.errors import storage
 from stage.files import replacing, write_text
 
+T = TypeVar("T")
+SCRATCH, PROBE = "scratch", "probe"
+"""Folder of the copies of objects in the data folder, and the object that a check writes."""
 FILES, RECORD, LOCK = "files", "objects.json", "lock"
-WAIT_S = 0.2
+TRANSFERS = 8
+"""Files that are transferred at one time."""
+LOOK_S, WAIT_S = 0.5, 0.2
+"""Seconds between two reports of progress, and between two looks for a lock."""
+CHECK_S = 30.0
+"""Seconds for which the result of a check counts: each check costs two requests."""
 IN_USE_S = 6 * 3600.0
 """Seconds for which a used prefix stays, whatever the limit: a step may read or write it."""
 SAVE_S = 2.0
@@ -81,120 +89,35 @@ class Entry:
         self._saved_at = time.monotonic()
 
 
-class Scratch:
-    """The copies of objects on this machine."""
-
-    def __init__(self, root: Path, limit_bytes: int) -> None:
-        self._root, self._limit_bytes = root, limit_bytes
-
-    def files(self, prefix: str) -> Path:
-        """Return the folder with the files of a prefix, which is made if there is none."""
-        folder = self._root / prefix / FILES
-        with storage("make", folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        return folder
-
-    @contextmanager
-    def entry(self, prefix: str, waiting: Callable[[], None]) -> Iterator[Entry]:
-        """Lock the copies of a prefix; `waiting` is called again and again while another process has the lock."""
-        with self._lock(prefix, waiting):
-            entry = Entry(self._root / prefix)
-            try:
-                yield entry
-            finally:
-                entry.save()
-
-    def remove(self, prefix: str) -> None:
-        """Delete the copies of a prefix."""
-        drop_folder(self._root / prefix)
-
-    def tidy(self) -> None:
-        """Delete what an interrupted deletion has left."""
-        drop_hidden(self._root)
-
-    def make_room(self, wanted_bytes: int) -> None:
-        """Delete the prefixes that were unused longest until `wanted_bytes` more fit into the limit; prefixes in use stay."""
-        found = sorted((_used_at(lock.parent), _size(lock.parent / FILES), lock.parent)
-                       for lock in self._root.glob(f"projects/*/*/*/{LOCK}"))
-        total = wanted_bytes + sum(size for _, size, _ in found)
-        for used_at, size, folder in found:
-            if total <= self._limit_bytes or used_at > time.time() - IN_USE_S:
-                return
-            drop_folder(folder)
-            total -= size
-
-    @contextmanager
-    def _lock(self, prefix: str, waiting: Callable[[], None]) -> Iterator[None]:
-        path = self._root / prefix / LOCK
-        while True:
-            self.files(prefix)  # the folder may be deleted meanwhile
-            with storage("make", path):
-                descriptor = file_lock.take(path, 0o644)
-            if descriptor is not None:
-                break
-            waiting()
-            time.sleep(WAIT_S)
-        try:
-            os.utime(descriptor)
-            yield
-        finally:
-            os.close(descriptor)
-
-
-def _state(path: Path) -> list[object]:
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    return [status.st_size, status.st_mtime_ns]
-
-
-def _used_at(folder: Path) -> float:
-    return max((path.stat().st_mtime for path in (folder / LOCK, folder / FILES) if path.exists()), default=0.0)
-
-
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-T = TypeVar("T")
-TRANSFERS = 8
-"""Files that are transferred at one time."""
-LOOK_S = 0.5
-"""Seconds between two reports of progress."""
-SCRATCH = "scratch"
-"""Name of the folder, in the data folder, for copies of objects."""
-PROBE = "probe"
-CHECK_S = 30.0
-"""Seconds for which the result of a check counts: each check costs two requests."""
-
-
 class ObjectStorage:
-    """A storage whose files are the objects of a bucket."""
+    """A storage whose files are the objects of a bucket, with copies of at most `scratch_bytes`, besides those in use, on this machine."""
 
-    def __init__(self, bucket: Bucket, scratch: Scratch) -> None:
-        self._bucket, self._scratch = bucket, scratch
+    def __init__(self, bucket: Bucket, scratch: Path, scratch_bytes: int) -> None:
+        self._bucket, self._scratch, self._scratch_bytes = bucket, scratch, scratch_bytes
         self._checking = threading.Lock()
         self._checked_at = -CHECK_S
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
         """Return a folder with copies; a copy of the same version is not fetched again."""
         objects = self._objects(prefix)
-        with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
+        with self._entry(prefix, progress) as entry:
             if names is None:
                 entry.forget_others(set(objects))
             missing = {name: found for name, found in objects.items()
                        if (names is None or name in names) and entry.version(name) != found.version}
             self._fetch(entry, missing, progress)
-        return self._scratch.files(prefix)
+        return self.workspace(prefix)
 
     def workspace(self, prefix: str) -> Path:
-        """Return the folder of the copies, into which results are written."""
-        return self._scratch.files(prefix)
+        """Return the folder of the copies, into which results are written; it is made if there is none."""
+        folder = self._scratch / prefix / FILES
+        with storage("make", folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
 
     def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
         """Send the files that are new or have changed, each complete or not at all; `alone` is that of Storage."""
-        with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
+        with self._entry(prefix, progress) as entry:
             if alone:
                 sweep(entry.files)
             new = [stored for stored in stored_below(entry.files) if entry.version(stored.name) is None]
@@ -217,31 +140,23 @@ class ObjectStorage:
         """Return all files of a prefix, by name."""
         return sorted(StoredFile(name, found.size, found.modified_at) for name, found in self._objects(prefix).items())
 
-    def open(self, prefix: str, name: str) -> Path | None:
-        """Return a copy of one object, which is fetched if it has changed; None: there is no such object."""
-        opened = self.open_file(prefix, name)
-        if opened is None:
-            return None
-        os.close(opened.descriptor)
-        return self._scratch.files(prefix) / name
-
-    def open_file(self, prefix: str, name: str) -> OpenFile | None:
+    def open(self, prefix: str, name: str) -> OpenFile | None:
         """Open a copy of one object, which is fetched if it has changed; its version is that of the object, on every machine."""
         if not is_shown(name) or self._is_removed(prefix):
             return None
         found = self._bucket.find(f"{prefix}/{name}")
         if found is None:
             return None
-        with self._scratch.entry(prefix, lambda: None) as entry:
+        with self._entry(prefix, None) as entry:
             if entry.version(name) != found.version:
                 self._fetch(entry, {name: found}, None)
             descriptor = os.open(entry.files / name, os.O_RDONLY | os.O_CLOEXEC)
-        return OpenFile(descriptor, found.size, found.modified_at, hashlib.sha256(found.version.encode()).hexdigest()[:32])
+        return OpenFile(name, descriptor, found.size, found.modified_at, hashlib.sha256(found.version.encode()).hexdigest()[:32])
 
     def remove(self, prefix: str) -> None:
         """Delete the objects; the object removed/PREFIX exists meanwhile, so that a part of the prefix is not shown."""
         self._bucket.mark(f"{REMOVED}/{prefix}")
-        self._scratch.remove(prefix)
+        drop_folder(self._scratch / prefix)
         self._bucket.delete([found.path for found in self._bucket.below(prefix)])
         self._bucket.delete([f"{REMOVED}/{prefix}"])
 
@@ -253,7 +168,7 @@ class ObjectStorage:
         """Delete the prefixes and copies whose deletion was interrupted."""
         for found in self._bucket.below(REMOVED):
             self.remove(found.path.removeprefix(f"{REMOVED}/"))
-        self._scratch.tidy()
+        drop_hidden(self._scratch)
 
     def check(self) -> None:
         """Write and delete an object, at most once in CHECK_S."""
@@ -274,7 +189,7 @@ class ObjectStorage:
     def _fetch(self, entry: Entry, missing: dict[str, Object], progress: Progress | None) -> None:
         if not missing:
             return
-        self._scratch.make_room(sum(found.size for found in missing.values()))
+        self._make_room(sum(found.size for found in missing.values()))
 
         def fetch(item: tuple[str, Object], moved: Callable[[], None]) -> tuple[str, str]:
             name, found = item
@@ -283,6 +198,40 @@ class ObjectStorage:
             return name, found.version
 
         _transfer("download", list(missing.items()), fetch, entry, progress)
+
+    @contextmanager
+    def _entry(self, prefix: str, progress: Progress | None) -> Iterator[Entry]:
+        """Lock the copies of a prefix; while another process has the lock, the progress is told that this one lives."""
+        path = self._scratch / prefix / LOCK
+        while True:
+            self.workspace(prefix)  # it may be deleted meanwhile
+            with storage("make", path):
+                descriptor = file_lock.take(path, 0o644)
+            if descriptor is not None:
+                break
+            if progress is not None:
+                progress.advance(0)
+            time.sleep(WAIT_S)
+        try:
+            os.utime(descriptor)
+            entry = Entry(path.parent)
+            try:
+                yield entry
+            finally:
+                entry.save()
+        finally:
+            os.close(descriptor)
+
+    def _make_room(self, wanted_bytes: int) -> None:
+        """Delete the copies of the prefixes that were unused longest until `wanted_bytes` more fit in; those in use stay."""
+        found = sorted((_used_at(lock.parent), _size(lock.parent / FILES), lock.parent)
+                       for lock in self._scratch.glob(f"projects/*/*/*/{LOCK}"))
+        total = wanted_bytes + sum(size for _, size, _ in found)
+        for used_at, size, folder in found:
+            if total <= self._scratch_bytes or used_at > time.time() - IN_USE_S:
+                return
+            drop_folder(folder)
+            total -= size
 
 
 Storage = FolderStorage | ObjectStorage
@@ -293,7 +242,7 @@ def open_storage(settings: Settings) -> Storage:
     """Open the storage that the settings name; nothing is written into it."""
     if settings.storage_url is None:
         return FolderStorage(settings.data)
-    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))
+    return ObjectStorage(Bucket(settings.storage_url), settings.data / SCRATCH, settings.scratch_bytes)
 
 
 class _Ended(Exception):
@@ -330,6 +279,17 @@ def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], No
             raise
 
 
-def _sign_of_life(progress: Progress | None) -> Callable[[], None]:
-    """Return what to call while another worker of this machine transfers the files."""
-    return (lambda: None) if progress is None else (lambda: progress.advance(0))
+def _state(path: Path) -> list[object]:
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _used_at(folder: Path) -> float:
+    return max((path.stat().st_mtime for path in (folder / LOCK, folder / FILES) if path.exists()), default=0.0)
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

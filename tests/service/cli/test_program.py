@@ -1,9 +1,12 @@
 """The program itself: help, version, doctor, import and info, wrong options, and the way it ends."""
 
+import multiprocessing
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,7 +80,8 @@ def test_a_driver_that_is_too_old_for_the_gpu_is_said(relit, tmp_path, monkeypat
     assert sentence in relit("solve", capture, "--method", "lambert", "--out", tmp_path / "out").out
     assert sentence not in relit("solve", capture, "--method", "lambert", "--device", "cpu", "--out", tmp_path / "out").out
     said = []
-    monkeypatch.setattr(process_devices, "_elsewhere", lambda ask, *given: ask(*given))
+    here = SimpleNamespace(apply=lambda ask, given: ask(*given))
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: SimpleNamespace(Pool=lambda _: nullcontext(here)))
     monkeypatch.setattr(logger, "warning", said.append)
     process_devices.of_workers(Settings(data=tmp_path / "data"))
     process_devices.resolve(None)

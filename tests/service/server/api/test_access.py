@@ -150,8 +150,8 @@ def test_machines_and_the_audit_log_are_for_admins_and_show_nothing_of_other_pro
         assert (worker["device"], worker["state"], worker["busy"], worker["job"]) == ("cpu", "ready", False, None)
         assert writer.post("/v1/machines/worker/kill").status_code == 403
         assert admin.post("/v1/machines/nobody/kill").status_code == admin.post("/v1/machines/nobody/drain").status_code == 404
-        assert worker["asked"] is None and workers.asked_of(site.database, "worker") is None
-        assert admin.post("/v1/machines/worker/drain").json()["asked"] == "drain" == workers.asked_of(site.database, "worker")
+        assert worker["asked"] is None and workers.seen_lately(site.database)[0]["asked"] is None
+        assert admin.post("/v1/machines/worker/drain").json()["asked"] == "drain" == workers.seen_lately(site.database)[0]["asked"]
         last = admin.get("/v1/audit", params={"limit": 1}).json()["entries"][0]
         assert (last["action"], last["object"]) == ("worker.drain", "worker")
         site.database.execute(tables.workers.delete())

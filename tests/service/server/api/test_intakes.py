@@ -9,7 +9,7 @@ from service.client import Client
 from service.publish.annotations import read_annotations
 from service.requests.base.identifiers import ANNOTATION, CAPTURE, new_id
 from service.requests.jobs import CheckJob
-from service.server.database import annotations, intakes, jobs
+from service.server.database import intakes, jobs
 from service.server.database.engine import connect
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
@@ -211,12 +211,12 @@ def test_a_capture_has_so_many_and_no_more(client, noted, monkeypatch, server):
     full = admitted(server, client, SAMPLES / "lambert")["id"]
     path = f"/v1/captures/{full}/annotations"
     with server.database() as database:
-        for _ in range(annotations.MOST):
-            database.transact(lambda connection: annotations.insert(connection, full, POINT | {"type": "Annotation"}))
-    refused(client.post(path, json=POINT), 409, f"has {annotations.MOST} annotations already")
+        for _ in range(intakes.MOST_ANNOTATIONS):
+            database.transact(lambda connection: intakes.annotate(connection, full, POINT | {"type": "Annotation"}))
+    refused(client.post(path, json=POINT), 409, f"has {intakes.MOST_ANNOTATIONS} annotations already")
     assert client.delete(f"/v1/captures/{full}").status_code == 204
     with server.database() as database:
-        assert annotations.listing(database, full) == []
+        assert intakes.annotations_of(database, full) == []
     refused(client.get(path), 404, full)
 
 

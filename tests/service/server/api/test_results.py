@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from service.server.api import results as routes
 from service.server.api.problems import ApiError
-from service.server.api.results import Opened, _names, _part
+from service.server.api.results import _names, _part
 from service.server.base.settings import Settings
-from service.server.storage.folder import FolderStorage
+from service.server.storage.folder import FolderStorage, OpenFile
 from stage.errors import StorageError
 from stage.formats import exr
 from tests.service.server.api.asgi import Call, app_of
@@ -282,7 +282,7 @@ def test_names_with_tricks_never_reach_the_storage(tmp_path):
 
 @given(st.integers(0, 120), st.integers(0, 120), st.integers(0, 100))
 def test_a_range_is_cut_to_the_file(start, beyond, size):
-    file = Opened("x.bin", 0, size, '"a"', 0.0)
+    file = OpenFile("x.bin", 0, size, 0.0, "a")
     if start < size:
         assert _part(f"bytes={start}-{start + beyond}", file) == range(start, min(start + beyond + 1, size))
     else:
@@ -294,6 +294,6 @@ def test_a_range_is_cut_to_the_file(start, beyond, size):
 @given(st.text())
 def test_any_range_and_any_tag_can_be_said(text):
     with suppress(ApiError):
-        part = _part(text, Opened("x.bin", 0, 10, '"a"', 0.0))
+        part = _part(text, OpenFile("x.bin", 0, 10, 0.0, "a"))
         assert part is None or 0 <= part.start < part.stop <= 10
     assert _names(text, '"a"', strong=True) <= _names(text, '"a"', strong=False)

@@ -8,15 +8,16 @@ import signal
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service.requests.keys import Scope
-from service.server.api import uploads as api_uploads
+from service.server.api.upload_patch import UploadPatch
 from service.server.base.settings import Settings
 from service.server.database import tables
-from service.server.storage.part_files import PartFile, PartFileLocked
+from service.server.storage.upload_parts import PartFileLocked, UploadParts
 from tests.service.server.api.asgi import app_of
 from tests.service.server.api.test_uploads import begun, made, part, stored
 from tests.service.server.api.tus import Tus, checksum, encoded
@@ -178,25 +179,26 @@ def test_files_are_not_for_everybody(server, tus, capture):
 
 
 def test_a_part_is_locked_once(tmp_path):
-    with PartFile.open(tmp_path, "up_1") as first, pytest.raises(PartFileLocked):
+    parts, upload = UploadParts(tmp_path, None), {"id": "up_1"}
+    with closing(parts.open(upload)) as first, pytest.raises(PartFileLocked):
         first.append([b"da", b"", b"ta"])
-        PartFile.open(tmp_path, "up_1")
-    with PartFile.open(tmp_path, "up_1") as again:
+        parts.open(upload)
+    with closing(parts.open(upload)) as again:
         assert again.size == 4
 
 
 @pytest.mark.parametrize("checked", [False, True], ids=["plain", "with a checksum"])
 def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(tmp_path, monkeypatch, checked):
-    write_body = api_uploads.write_body
+    write = UploadPatch.write
     with app_of(Settings(data=tmp_path / "data", min_free_bytes=0)) as app:
         database = app.state.service.database
         key, other = (new_key(database, scope=Scope.WRITE) for _ in range(2))
 
-        async def write_and_revoke(*arguments) -> None:
-            await write_body(*arguments)
+        async def write_and_revoke(patch, stream) -> None:
+            await write(patch, stream)
             revoke(database, key)
 
-        monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
+        monkeypatch.setattr(UploadPatch, "write", write_and_revoke)
         with TestClient(app, headers={"Authorization": f"Bearer {key}", "Tus-Resumable": "1.0.0"}) as client:
             capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
             place = client.post(f"/v1/captures/{capture}/files", headers={

@@ -58,16 +58,17 @@ def test_a_key_expires(relit, data, database):
     key = relit("keys", "create", "--data", data, "--project", "larch", "--name", "x", "--scope", "read", "--expires-days", "2").out.strip()
     until = keys.listing(database)[0]["expires_at"]
     assert until == pytest.approx(time.time() + 2 * 86_400, abs=600)  # the time that this test takes
-    assert keys.find(database, key).until == until and keys.still_valid(database, [key.partition(".")[0]])
+    caller = keys.find(database, key)
+    assert caller.until == until and not keys.no_longer_valid(database, [caller])
     database.transact(lambda connection: connection.execute(tables.keys.update().values(expires_at=time.time() - 1)))
-    assert keys.find(database, key) is None and not keys.still_valid(database, [key.partition(".")[0]])
+    assert "expired" in keys.find(database, key) and keys.no_longer_valid(database, [caller]) == {caller}
 
 
 def test_the_last_use_of_a_key_is_recorded_to_a_minute(relit, made, data, database):
     key = made()
-    assert keys.find(database, f"{key}x") is None
+    assert keys.find(database, f"{key}x") == "this service does not know the key"
     assert keys.listing(database)[0]["used_at"] is None
-    assert keys.find(database, key)
+    assert isinstance(keys.find(database, key), keys.Caller)
     first = keys.listing(database)[0]["used_at"]
     assert first == pytest.approx(time.time(), abs=600)
     assert keys.find(database, key) and keys.listing(database)[0]["used_at"] == first

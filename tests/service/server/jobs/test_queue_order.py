@@ -1,6 +1,6 @@
 """In which order jobs are done: projects take turns, and those of one project go by priority and by time.
 
-These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.dbos_tables writes.
+These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.queue writes.
 """
 
 import time

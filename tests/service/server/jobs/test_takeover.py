@@ -6,11 +6,10 @@ import pytest
 import sqlalchemy as sa
 
 from service.server.database import jobs, workers
-from service.server.database.jobs import Claim, StageProgress
+from service.server.database.jobs import Claim
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.queue import workflow_id
-from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
-from service.server.jobs.worker_lock import LockState, open_worker_lock
+from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, LockState, Takeover, open_worker_lock
 from tests.service.server.jobs.harness import harness
 
 MAX_LOST = 3
@@ -79,7 +78,7 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
     one.round()
     before = dict(idle_harness.row(job))
     assert not jobs.begin(idle_harness.database, Claim(job, 2, "gone"))
-    assert not jobs.advance(idle_harness.database, gone, StageProgress("frames", 3, 10, None))
+    assert not jobs.advance(idle_harness.database, gone, "frames", 3, 10, None)
     assert not jobs.finish_step(idle_harness.database, gone, ["frames 1-5"])
     assert not jobs.end(idle_harness.database, gone, jobs.FAILED, "it says")
     assert not jobs.is_claimed(idle_harness.database, gone)
@@ -136,7 +135,7 @@ def test_a_second_reaper_finds_nothing_to_do(idle_harness, takeover, job, monkey
 
 def test_a_job_that_loses_too_many_workers_fails(idle_harness, takeover, job):
     _, one = takeover("one")
-    jobs.advance(idle_harness.database, Claim(job, 1, "gone"), StageProgress("open", 0, 1, None))
+    jobs.advance(idle_harness.database, Claim(job, 1, "gone"), "open", 0, 1, None)
     for lost in range(1, MAX_LOST + 2):
         one.round()
         assert idle_harness.row(job)["lost"] == lost
@@ -156,12 +155,12 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, tak
         idle_harness.claim(job, "gone")
 
     lose()
-    jobs.advance(database, gone, StageProgress("frames", 4, 10, None))
+    jobs.advance(database, gone, "frames", 4, 10, None)
     assert idle_harness.row(job)["lost"] == 0
     lose()
-    jobs.advance(database, gone, StageProgress("frames", 4, 10, None))  # the next worker comes as far, and no further
+    jobs.advance(database, gone, "frames", 4, 10, None)  # the next worker comes as far, and no further
     assert idle_harness.row(job)["lost"] == 1
-    jobs.advance(database, gone, StageProgress("normals", 9, 10, None), repeating=False)  # a stage that begins again is no progress
+    jobs.advance(database, gone, "normals", 9, 10, None, repeating=False)  # a stage that begins again is no progress
     assert idle_harness.row(job)["lost"] == 1
     jobs.finish_step(database, gone, ["frames 1-5"])
     assert idle_harness.row(job)["lost"] == 0

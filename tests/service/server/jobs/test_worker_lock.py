@@ -8,7 +8,7 @@ import sqlalchemy as sa
 from service.server.base.settings import Settings
 from service.server.database.engine import UNANSWERED
 from service.server.jobs import supervisor
-from service.server.jobs.worker_lock import KEEPALIVE, AdvisoryWorkerLock, FileWorkerLock, LockState, open_worker_lock
+from service.server.jobs.takeover import KEEPALIVE, AdvisoryWorkerLock, FileWorkerLock, LockState, open_worker_lock
 from tests.service.server.jobs import stand_ins
 from tests.service.server.jobs.harness import harness
 

@@ -1,6 +1,7 @@
 """What the service clears away by itself, and what it leaves alone; days pass by an injected clock."""
 
 import os
+from contextlib import closing
 
 import sqlalchemy as sa
 
@@ -10,7 +11,7 @@ from service.server.database import audit, idempotency, intakes, jobs, tables, u
 from service.server.process import housekeeping
 from service.server.process.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, part_files_folder
+from service.server.storage.upload_parts import open_upload_parts, part_files_folder
 from tests.service.server.process.house import DAYS, PROJECT, House
 from tests.service.waiting import until
 
@@ -60,18 +61,19 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 
 def test_uploads_that_nobody_goes_on_with_expire(house):
     capture, folder = house.capture(), part_files_folder(house.settings)
+    parts = open_upload_parts(house.settings, house.database, house.storage)
     upload, done = new_id(UPLOAD), new_id(UPLOAD)
     for identifier in (upload, done):
         house.database.transact(lambda connection, identifier=identifier: uploads.insert(
             connection, identifier=identifier, project=PROJECT, intake=capture, path=identifier, length=10, sha256=None))
     assert uploads.finish(house.database, done, 10)
-    with PartFile.open(folder, upload) as part:
+    with closing(parts.open({"id": upload})) as part:
         part.append([b"12345"])
-    PartFile.open(folder, "up_orphan").close()
+    parts.open({"id": "up_orphan"}).close()
     house.round(47 * HOUR_S)
     assert uploads.find(house.database, upload, PROJECT) and {path.stem for path in folder.iterdir()} == {upload, "up_orphan"}
     house.now += 2 * HOUR_S
-    with PartFile.open(folder, upload):  # a request adds to it
+    with closing(parts.open({"id": upload})):  # a request adds to it
         house.round()
         assert uploads.find(house.database, upload, PROJECT)
     house.round()
@@ -87,7 +89,7 @@ def test_tokens_are_remembered_for_a_day_and_lines_of_the_audit_log_for_audit_da
         return made[-1]
 
     def ask() -> str:
-        return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)[0]
+        return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)
 
     ask()
     house.round(0.9 * DAY_S)
@@ -199,14 +201,14 @@ def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypa
     """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
     bad, good = house.job(), house.job()
     house.now += 2 * DAYS * DAY_S
-    forget = housekeeping._forget
+    remove = jobs.remove
 
     def fail(connection, job):
         if job == bad:
             raise ValueError("no such character")
-        return forget(connection, job)
+        return remove(connection, job)
 
-    monkeypatch.setattr(housekeeping, "_forget", fail)
+    monkeypatch.setattr(jobs, "remove", fail)
     logged = []
     monkeypatch.setattr(housekeeping.logger, "error", lambda event, **fields: logged.append((event, fields["piece"])))
     stale = house.cache(new_id(CAPTURE))

@@ -43,7 +43,7 @@ def test_the_results_of_the_demo_are_those_of_jobs_that_have_succeeded(tmp_path,
     assert len({row["request"]["capture"] for row in rows.values()}) == 1
     for key, folder in {("pipeline", False): "demo", ("view", True): "maps", ("view", False): "capture"}.items():
         prefix = layout.results(DEFAULT_PROJECT, rows[key]["id"])
-        stored = {file.name: storage.open(prefix, file.name).read_text() for file in storage.files(prefix)}
+        stored = {file.name: (storage.local(prefix) / file.name).read_text() for file in storage.files(prefix)}
         assert stored == {path.name: f"{folder} {path.name}" for path in made[("demo", "capture", "maps").index(folder)]}
     assert "pages    http://x/" in capsys.readouterr().out
     for _ in range(2):  # without results, too, it is registered once

@@ -18,7 +18,7 @@ import pytest
 
 from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage
-from service.server.storage.objects import ObjectStorage, Scratch, Storage
+from service.server.storage.objects import ObjectStorage, Storage
 from tests.service.waiting import free_port, until
 
 LIMIT = 1 << 30
@@ -75,7 +75,7 @@ Machine = Callable[[str], Storage]
 @pytest.fixture
 def machine(url: str, tmp_path: Path) -> Machine:
     """The same object store as machines of these names see it, each with a disk of its own."""
-    return lambda name: ObjectStorage(Bucket(url), Scratch(tmp_path / name, LIMIT))
+    return lambda name: ObjectStorage(Bucket(url), tmp_path / name, LIMIT)
 
 
 @pytest.fixture(params=["folder", *FILE_OR_S3])
@@ -84,4 +84,4 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
     if request.param == "folder":
         return FolderStorage(tmp_path / "data")
     url = (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
-    return ObjectStorage(Bucket(url), Scratch(tmp_path / "scratch", LIMIT))
+    return ObjectStorage(Bucket(url), tmp_path / "scratch", LIMIT)

@@ -13,7 +13,7 @@ from service.server.base.settings import Settings
 from service.server.storage import bucket as buckets
 from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage
-from service.server.storage.objects import IN_USE_S, ObjectStorage, Scratch, open_storage
+from service.server.storage.objects import IN_USE_S, ObjectStorage, open_storage
 from stage.errors import StorageError
 from tests.service.recording import Recording
 from tests.service.server.tcp_proxy import tcp_proxy
@@ -198,7 +198,7 @@ def test_two_workers_of_a_machine_fetch_once(machine, tmp_path, fetched):
 
 def test_copies_are_bounded(tmp_path):
     """Beyond the limit the one longest unused goes first; one that is in use stays, and so does what is within the limit."""
-    storage = ObjectStorage(Bucket((tmp_path / "store").as_uri()), Scratch(tmp_path / "b", 1000))
+    storage = ObjectStorage(Bucket((tmp_path / "store").as_uri()), tmp_path / "b", 1000)
     prefixes = [f"projects/film/captures/cap_{number}" for number in range(4)]
     for number, prefix in enumerate(prefixes):
         put(storage, tmp_path, "000.exr", bytes(400), prefix)
@@ -243,7 +243,7 @@ def test_a_store_that_does_not_answer_is_a_sentence(monkeypatch, tmp_path):
     for name, value in {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", "AWS_ALLOW_HTTP": "true", "AWS_ACCESS_KEY_ID": "a",
                         "AWS_SECRET_ACCESS_KEY": "s3cret", "AWS_REGION": "us-east-1"}.items():
         monkeypatch.setenv(name, value)
-    storage = ObjectStorage(Bucket("s3://bucket/prefix"), Scratch(tmp_path, LIMIT))
+    storage = ObjectStorage(Bucket("s3://bucket/prefix"), tmp_path, LIMIT)
     with pytest.raises(StorageError, match=r"^cannot write s3://bucket/prefix/probe: .*") as told:
         storage.check()
     assert "\n" not in str(told.value) and "s3cret" not in str(told.value)

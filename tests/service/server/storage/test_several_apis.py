@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -153,7 +154,7 @@ def test_deleted_and_expired_uploads_leave_no_pieces(site):
     (site.store / "uploads" / "up_orphan").mkdir()
     (site.store / "uploads" / "up_orphan" / "0").write_bytes(b"x")
     row = uploads.find(database, busy.rpartition("/")[2], "default")
-    with parts.open(row):  # a request adds to it
+    with closing(parts.open(row)):  # a request adds to it
         assert one.patch(busy, MIB, CONTENT[MIB:]).status == 423
         assert parts.expire(time.time() + 60) >= 1
         assert pieces(expired) == [] and len(pieces(busy)) == 1 and not any((site.store / "uploads" / "up_orphan").glob("*"))
@@ -169,10 +170,10 @@ def test_a_writer_that_was_thought_dead_counts_nothing(site, monkeypatch):
     parts = open_upload_parts(settings, database, open_storage(settings))
     identifier = upload.rpartition("/")[2]
     row = uploads.find(database, identifier, "default")
-    with parts.open(row) as slow:
+    with closing(parts.open(row)) as slow:
         slow.append([b"x" * MIB])
         assert Tus(site.second.url).patch(upload, 0, CONTENT[:MIB]).offset == MIB  # its lease is over
-        assert not parts.save(slow, identifier, MIB) and not parts.finish(slow, identifier, MIB)
+        assert not slow.save(MIB) and not slow.finish()
     assert Tus(site.first.url).patch(upload, MIB, CONTENT[MIB:]).offset == len(CONTENT)
     assert stored(site, capture).read_bytes() == CONTENT
     database.close()

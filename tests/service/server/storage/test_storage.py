@@ -12,7 +12,7 @@ from service.server.storage import layout, objects
 from service.server.storage.bucket import PIECE_BYTES
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import SCRATCH, Storage
-from service.server.storage.part_files import part_files_folder
+from service.server.storage.upload_parts import part_files_folder
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
@@ -37,9 +37,13 @@ def test_what_is_published_is_there(storage):
     found = storage.files(RESULTS)
     assert [(stored.name, stored.size) for stored in found] == [("deep/er/report.json", 2), ("maps.exr", 4)]
     assert all(before - 5 < stored.modified_at < time.time() + 5 for stored in found)  # clocks of stores count in seconds, and differ
-    path = storage.open(RESULTS, "maps.exr")
-    assert path is not None and path.read_bytes() == b"maps"
+    assert content_of(storage, RESULTS, "maps.exr") == b"maps"
     assert (storage.local(RESULTS) / "deep/er/report.json").read_bytes() == b"{}"
+
+
+def content_of(storage: Storage, prefix: str, name: str) -> bytes:
+    with open(storage.open(prefix, name).descriptor, "rb") as file:
+        return file.read()
 
 
 def test_half_written_files_are_never_part_of_it(storage):
@@ -65,21 +69,18 @@ def test_files_are_put_with_any_name_that_a_file_may_have(storage, tmp_path):
     folder = storage.local(CAPTURE)
     for name in NAMES:
         assert (folder / name).read_bytes() == name.encode()
-        opened = storage.open(CAPTURE, name)
-        assert opened is not None and opened.read_bytes() == name.encode()
+        assert content_of(storage, CAPTURE, name) == name.encode()
 
 
 def test_a_file_put_or_published_again_takes_the_place_of_the_first(storage, tmp_path):
     for content in (b"first", b"other"):  # of equal size, in the same second
         write(storage.workspace(RESULTS), "report.json", content)
         storage.publish(RESULTS)
-        opened = storage.open(RESULTS, "report.json")
-        assert opened is not None and opened.read_bytes() == content
+        assert content_of(storage, RESULTS, "report.json") == content
         (tmp_path / "upload").write_bytes(content)
         storage.put(tmp_path / "upload", CAPTURE, "000.exr")
         assert (storage.local(CAPTURE) / "000.exr").read_bytes() == content
-        opened = storage.open(CAPTURE, "000.exr")
-        assert opened is not None and opened.read_bytes() == content
+        assert content_of(storage, CAPTURE, "000.exr") == content
     assert names(storage, CAPTURE) == ["000.exr"]
 
 
