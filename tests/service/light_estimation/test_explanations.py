@@ -52,6 +52,6 @@ def test_what_fits_beside_metal_tells_that_axes_are_right():
     lights = lights[lights[:, 2] > 0.4]
     matt = np.maximum(lights @ unit(draw.normal(size=(150, 3)) * [0.5, 0.5, 0] + [0, 0, 1]).T, 0)
     away = lights @ unit(np.array([-1.0, 0.0, -0.3]) + 0.1 * draw.normal(size=(450, 3))).T
-    metal = np.where(away > 0, away * np.exp(0.6 * draw.normal(size=away.shape)), 0)
+    metal = np.where(away > 0, away * np.exp(1.2 * draw.normal(size=away.shape)), 0)
     fit = fit_manifest(sample_of(np.concatenate([matt, metal], axis=1), lights))
     assert fit.facing < FACING and fit.towards_camera is None
