@@ -21,7 +21,7 @@ from service.asset.usd.surroundings import Surroundings
 from service.errors import AssetError, RequestError, SurfaceError
 from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import export_metadata
+from service.reporting.provenance import export_metadata, other_manifest
 from service.requests.export import AssetFormat, ExportRequest, Geometry, TextureFormat
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
@@ -114,6 +114,8 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
                 *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"), *report.warnings]
     if (plain := _plain(maps)) is not None:
         warnings.append(plain)
+    if around.rig is not None and (doubt := other_manifest(maps, around.rig, path)) is not None:
+        warnings.append(doubt)
     if maps.diffuse_albedo is None:
         warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
     warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
