@@ -46,7 +46,6 @@ EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime"
 LINEAR = "lin_rec709_scene"
 OF_ONE_STEP = ("relit:capture", "relit:inputs")
 """Provenance that steps do not share; the asset has a hash of the results of all."""
-LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "height", "part")
 
 
 class Exported(NamedTuple):
@@ -264,7 +263,7 @@ def _moments(request: ExportRequest, sequence: Sequence, files: list[Path], came
 
 def _of_maps(file: Path, time_code: float) -> tuple[Moment, list[str], Camera]:
     """Return the surface of solved maps, with their normals, and the base colour of the metallic workflow."""
-    maps, _, repairs = repair_heights(SurfaceMaps.read(file, layers=LAYERS))
+    maps, _, repairs = repair_heights(SurfaceMaps.read(file, layers=EXPORTED_LAYERS))
     mesh = height_mesh(maps)
     normals = mesh.normals
     if maps.normal is not None:
