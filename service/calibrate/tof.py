@@ -20,6 +20,7 @@ from service.calibrate.solvers.tof_sweep import (
     contradicting,
     fit_steps,
     fit_wiggling,
+    of_target,
     target_faults,
     wiggling_sigma,
 )
@@ -55,6 +56,8 @@ MOST_SCATTER = 0.15
 """Scatter of the errors of ranges, as a part of what the highest frequency tells apart, beyond which no wiggling makes them."""
 MOST_WRONG = 0.2
 """Largest part of the steps that is left out."""
+LEAST_OFF_PLANE = 0.02
+"""Part of the readings off the plane of the target from which on they are said; noise leaves a thousandth."""
 FEWEST = 5
 """Fewest steps of which one can contradict the others."""
 DETERMINED = 0.5
@@ -137,7 +140,7 @@ def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibrat
         if not solved.solved.any() or solved.range_m is None:
             given = "" if calibration is None else " with the calibration that the distances give"
             raise RequestError(f"{capture.folder}: no pixel of this step is solved{given}: "
-                               f"{'; '.join(told) or 'check its frames and its mask'}")
+                               f"{'; '.join(told or solved.warnings) or 'check its frames and its mask'}")
         off = _half_path(solved.range_m.astype(np.float64), capture) - _true_half_path(step, capture)
         errors.append(float(np.median(off[solved.solved])))
     return np.array(errors)
@@ -215,20 +218,29 @@ def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, devi
     per_radian = SPEED_OF_LIGHT / (4 * np.pi * highest)
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(errors - np.median(errors))))
     if scatter > MOST_SCATTER * 2 * np.pi * per_radian:
+        depths = np.array([step.depth_m for step in plan.steps])
+        falls = ", and reference_phase_rad of the frames (--signal of relit import tof), for the ranges fall where depth_m grows"
         raise RequestError(f"steps: measured ranges differ from the declared distances by {scatter:.2g} m more at some than at others, "
-                           "which is no wiggling: check depth_m, its unit, and the order of the captures")
+                           "which is no wiggling: check depth_m, its unit, and the order of the captures"
+                           f"{falls if depths @ (depths + errors - (depths + errors).mean()) < 0 else ''}")
 
     def some(hz: float, steps: Iterable[int]) -> list[StepPhases]:
         return [phases[hz][step] for step in steps if step in phases[hz]]
 
+    seen = sum(len(readings.phase) for readings in phases[highest].values())
+    phases = {hz: of_target(own, hz) for hz, own in phases.items()}
     turn = target_faults(some(highest, phases[highest]), highest).turn
-    phases = {hz: {step: readings.turned(turn) for step, readings in own.items()} for hz, own in phases.items()}
+    phases = {hz: of_target({step: readings.turned(turn) for step, readings in own.items()}, hz) for hz, own in phases.items()}
+    off_plane = 1 - sum(len(readings.phase) for readings in phases[highest].values()) / seen
     kept, left_out, warnings = _consistent(plan, errors, phases[highest],
                                            lambda steps: fit_wiggling(some(highest, steps), highest).scatter * per_radian)
     if turn.any():
         axis, degrees = max(zip(("upright", "level"), np.degrees(np.arctan(np.abs(turn))), strict=True), key=lambda each: each[1])
         warnings = (*warnings, f"steps: the target does not face the camera: it is turned by {degrees:.2g}° about the {axis} axis in all "
                                "of them, which is taken out")
+    if off_plane > LEAST_OFF_PLANE:
+        warnings = (*warnings, f"steps: {off_plane:.0%} of the readings are off the plane of the target, as what stands behind, before or "
+                               "beside it, and are left out: give each capture a mask of the target alone")
     scale = target_faults(some(highest, kept), highest).scale
     tables = tuple(fit_harmonics(*all_readings(some(hz, kept)), hz) for hz in phases)
     known = wiggling_sigma({hz: some(hz, kept) for hz in phases})

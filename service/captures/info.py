@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.model.samples import evenly
 from service.light_estimation.dark_lights import dark_lights, dark_sentence
 from service.light_estimation.declared_lights import facing_sentence
 from service.light_estimation.explanations import (
@@ -22,6 +23,7 @@ from service.light_estimation.explanations import (
     grey_readings,
 )
 from service.light_estimation.lambertian import Fit, Suspect, suspects
+from service.light_estimation.light_axes import Grid, axes_sentence
 from service.reporting.progress import Progress, Timings
 from service.requests.captures import InfoRequest
 from stage.capture.capture import Capture
@@ -88,7 +90,8 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     frames = capture.manifest.frames
     timings.stage("frames", len(frames))
     levels = []
-    positions = pixels_to_look_at(capture)
+    looked = pixels_to_look_at(capture)
+    positions = None if looked is None else looked.chosen
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
         for level in pool.map(lambda frame: _level(capture, frame, positions), frames):
             levels.append(level)
@@ -115,9 +118,9 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         with suppress(StageError):
             facts.append(("near lights", FAR_UNKNOWN if distance_is_missing(capture) else _near_lights(place_lights(capture))))
     found = Findings([], {})
-    if positions is not None and not faults:
-        found = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
-                                              if level.picked is not None})
+    if looked is not None and not faults:
+        found = findings(capture, looked, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
+                                           if level.picked is not None})
     looks = [*capture.doubts, *found.sentences]
     if request.picture is not None:
         peak = max((level.peak for level in read), default=1.0)
@@ -288,41 +291,45 @@ def _hemisphere(count: int) -> np.ndarray:
 
 # Compare some pixels of each frame with the manifest, and report contradictions: encoding, brightness, order, single lights.
 
-def pixels_to_look_at(capture: Capture) -> np.ndarray | None:
-    """Return the row-major positions [n] of some pixels of the object; None where the lights of the capture contradict nothing.
+def pixels_to_look_at(capture: Capture) -> Grid | None:
+    """Return some pixels of the object; None where the lights of the capture contradict nothing.
 
     Lambert's law contradicts a manifest of distant lights only, and only where there are more of them than unknowns.
     """
     lit = capture.lit_by(DistantLight)
     if len(lit) < MIN_LIGHTS or len(lit) < len(capture.sources()) or has_placeholders(capture) or capture.is_polarised:
         return None
-    try:
-        inside = np.flatnonzero(capture.mask())
-    except StageError:
-        return None
-    return inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]
+    with suppress(StageError):
+        if (mask := capture.mask()).any() and (grid := Grid.of(mask)).inside.any():
+            return grid
+    return None
 
 
-def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.ndarray]) -> Findings:
+def findings(capture: Capture, looked: Grid, recorded: Mapping[str, np.ndarray]) -> Findings:
     """Return what explains the images much better than the manifest, else the lights that disagree with the others.
     `recorded`: [n, 3] float32 of each frame at these pixels, by the name of its image: fractions of full scale, or floating-point
     values."""
     lit = capture.lit_by(DistantLight)
-    correction = Correction.of(capture).at(positions)
+    correction = Correction.of(capture).at(looked.chosen)
     radiance = np.stack([correction.corrected(recorded[frame.image][:, None], frame)[:, 0] for frame, _ in lit]).astype(np.float64)
     limits = [saturation_limit(capture.manifest, capture.file(frame.image)) for frame, _ in lit]
     usable = np.stack([(recorded[frame.image] < np.float32(most)).all(axis=-1) for (frame, _), most in zip(lit, limits, strict=True)])
-    sample = Sample(radiance, usable, np.array([light.direction for _, light in lit]), np.array([light.irradiance for _, light in lit]),
-                    np.array([frame.exposure_s or 1.0 for frame, _ in lit]), capture.manifest.color_space)
+    some = evenly(len(looked.chosen), PIXELS)
+    sample = Sample(radiance[:, some], usable[:, some], np.array([light.direction for _, light in lit]),
+                    np.array([light.irradiance for _, light in lit]), np.array([frame.exposure_s or 1.0 for frame, _ in lit]),
+                    capture.manifest.color_space)
     fit = fit_manifest(sample)
     if (away := facing_sentence(fit)) is not None:
         return Findings([away], {})
-    dark = dark_lights(grey_readings(radiance, sample.irradiance), sample.directions)
+    readings = grey_readings(radiance, sample.irradiance)
+    dark = dark_lights(readings[:, some], sample.directions)
     if dark.any():
         images = [frame.image for frame, _ in lit]
         return Findings([dark_sentence(images, dark, "take them again, or out of the frames; a solve leaves them out")], {})
     if (found := better_explanation(sample, fit)) is not None:
         return Findings([explanation_sentence(found, sample)], {})
+    if (axes := axes_sentence(capture.camera, looked, readings, usable, sample.directions)) is not None:
+        return Findings([axes], {})
     off = _suspects(sample, fit)
     named = {lit[each.light][0].image: each.misfit for each in off}
     if not named:

@@ -21,7 +21,7 @@ from service.asset.usd.surroundings import Surroundings
 from service.errors import AssetError, RequestError, SurfaceError
 from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import export_metadata
+from service.reporting.provenance import export_metadata, other_manifest
 from service.requests.export import AssetFormat, ExportRequest, Geometry, TextureFormat
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
@@ -46,7 +46,6 @@ EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime"
 LINEAR = "lin_rec709_scene"
 OF_ONE_STEP = ("relit:capture", "relit:inputs")
 """Provenance that steps do not share; the asset has a hash of the results of all."""
-LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "height", "part")
 
 
 class Exported(NamedTuple):
@@ -114,6 +113,8 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
                 *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"), *report.warnings]
     if (plain := _plain(maps)) is not None:
         warnings.append(plain)
+    if around.rig is not None and (doubt := other_manifest(maps, around.rig, path)) is not None:
+        warnings.append(doubt)
     if maps.diffuse_albedo is None:
         warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
     warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
@@ -262,7 +263,7 @@ def _moments(request: ExportRequest, sequence: Sequence, files: list[Path], came
 
 def _of_maps(file: Path, time_code: float) -> tuple[Moment, list[str], Camera]:
     """Return the surface of solved maps, with their normals, and the base colour of the metallic workflow."""
-    maps, _, repairs = repair_heights(SurfaceMaps.read(file, layers=LAYERS))
+    maps, _, repairs = repair_heights(SurfaceMaps.read(file, layers=EXPORTED_LAYERS))
     mesh = height_mesh(maps)
     normals = mesh.normals
     if maps.normal is not None:

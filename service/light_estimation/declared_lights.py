@@ -4,8 +4,17 @@ import numpy as np
 
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.dark_lights import dark_frames, dark_sentence
-from service.light_estimation.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, explanation_sentence, fit_manifest
+from service.light_estimation.explanations import (
+    MIN_LIGHTS,
+    PIXELS,
+    Sample,
+    better_explanation,
+    explanation_sentence,
+    fit_manifest,
+    grey_readings,
+)
 from service.light_estimation.lambertian import Fit
+from service.light_estimation.light_axes import Grid, axes_sentence
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight
 from stage.capture.lighting import has_placeholders
@@ -37,8 +46,9 @@ def facing_sentence(fit: Fit) -> str | None:
 
 
 def declared_light_sentences(stack: Stack, capture: Capture, lights: DistantLights, mask: np.ndarray) -> list[str]:
-    """Return a sentence for what the images of a stack contradict: directions, dark frames, encoding, brightness, or order of the lights.
-    `lights`: those of the stack, near ones as distant ones; only dark frames are told of these. `mask`: [rows, cols] bool, the object."""
+    """Return a sentence for what the images of a stack contradict: directions, dark frames, encoding, brightness, order or axes of the
+    lights. `lights`: those of the stack, near ones as distant ones; only dark frames are told of these. `mask`: [rows, cols] bool, the
+    object."""
     judged = len(capture.lit_by(DistantLight)) == len(capture.sources()) and not capture.is_polarised and not has_placeholders(capture)
     fit = None
     if judged and len(lights.direction) >= MIN_LIGHTS and mask.any():
@@ -48,5 +58,10 @@ def declared_light_sentences(stack: Stack, capture: Capture, lights: DistantLigh
             return [away]
     if (dark := dark_frames(stack, lights, mask)).any():
         return [dark_sentence(stack.frames, dark, LEFT_IN)]
-    found = None if fit is None else better_explanation(sample, fit)
-    return [] if found is None else [explanation_sentence(found, sample)]
+    if fit is None:
+        return []
+    if (found := better_explanation(sample, fit)) is not None:
+        return [explanation_sentence(found, sample)]
+    radiance, usable = stack.pick_radiance((grid := Grid.of(mask)).chosen)
+    axes = axes_sentence(capture.camera, grid, grey_readings(radiance, lights.irradiance), usable, lights.direction)
+    return [] if axes is None else [axes]

@@ -67,8 +67,10 @@ def import_folder(source: Path, destination: Path | None, *, color_space: ColorS
                {"type": "distant", "direction": vector.tolist(), "irradiance": power.tolist()}}
               for name, vector, power in zip(names, vectors, strength, strict=True)]
     space, mask = color_space or color_space_of(folder / names[0]), select(folder, Selection()).mask
+    aligned = [f"frames[].image: {path.name} moves images so that they lie on one another, and they were taken as they are: align them "
+               "before if they do not"] if data.get("aligns") else []
     written = write_capture({"name": path.stem, "color_space": space, "camera": camera, "mask": mask,
-                             "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space),
+                             "irradiance_scale": "relative", "assumed": [*assumed_encoding(space, color_space), *aligned],
                              "frames": frames}, path, destination or folder, folder=folder)
     crop = ("crop", f"{path} crops the images; the capture has them whole") if data.get("crop") else None
     return Imported(written, tuple(fact for fact in (

@@ -12,6 +12,7 @@ from stage.capture.capture import Capture
 from stage.capture.point_lights import distance_is_missing
 from stage.errors import ResultError
 from stage.formats import exr
+from stage.results.normal_axes import normal_fault
 from stage.results.result_metadata import camera_and_provenance, result_metadata
 
 MAPS_FILE = "maps.exr"
@@ -129,6 +130,8 @@ class SurfaceMaps:
         mask = found.pop("mask") > 0.5
         if mask.shape != (camera.height, camera.width):
             raise ResultError(f"{path}: is {mask.shape[1]}x{mask.shape[0]}, its camera {camera.width}x{camera.height}")
+        if "normal" in found and (fault := normal_fault(camera, mask, found["normal"], found.get("height"), found.get("part"))) is not None:
+            raise ResultError(f"{path}: {fault}")
         estimated = None
         if unsure:
             estimated = mask | (found["normal"].any(axis=-1) if "normal" in found else False)

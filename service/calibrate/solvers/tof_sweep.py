@@ -30,6 +30,8 @@ PLACES = 1440
 """Ranges at which the fit of the wiggling is judged: thirty in a period of the highest harmonic, over four periods."""
 UNKNOWN_RAD = np.pi / 3**0.5
 """Standard deviation of a phase of which nothing is known."""
+OFF_PLANE, LEAST_OFF = 5.0, 0.01
+"""Robust standard deviations of what a fit leaves of a step's readings beyond which one is off the plane of the target; least radians."""
 GAP = 4.0
 """Standard deviation at a range, over the median of all, above which no distance shows its phases; 1.2 to 3 where distances do."""
 
@@ -97,6 +99,20 @@ def fit_wiggling(steps: Sequence[StepPhases], modulation_hz: float) -> Fit:
     """Fit the harmonics of one frequency to phases that were measured at known distances, in radians, as `fit_harmonics` does to all at
     once."""
     return fit_steps([harmonic_terms(step.phase) for step in steps], _errors(steps, modulation_hz))
+
+
+def of_target(steps: Mapping[int, StepPhases], modulation_hz: float) -> dict[int, StepPhases]:
+    """Return the readings of steps without those off the plane of the target, as of what stands behind it, before it and beside it."""
+    found = dict(steps)
+    for _ in range(ROUNDS):
+        readings = list(found.values())
+        values = fit_wiggling(readings, modulation_hz).values
+        for number, step, error in zip(found, readings, _errors(readings, modulation_hz), strict=True):
+            left = error - harmonic_terms(step.phase) @ values
+            away = np.abs(left - np.median(left))
+            held = away <= max(OFF_PLANE * MAD_TO_SIGMA * float(np.median(away)), LEAST_OFF)
+            found[number] = step._replace(phase=step.phase[held], range_m=step.range_m[held], aside=step.aside[held])
+    return found
 
 
 class WigglingSigma(NamedTuple):

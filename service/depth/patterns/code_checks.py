@@ -13,7 +13,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.levels import contrasts
-from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, EXPONENTS, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.kary import KaryCode, number_of
@@ -37,6 +37,9 @@ MENDED = 5.0
 """Jumps that another order mends over those that it makes."""
 LEFT_JUMPS = 0.1
 """Jumps, as a part of all steps, below which stripes of k-ary digits follow each other."""
+BENT_LEFT, LEAST_BENT = 0.65, 0.02
+"""Part of the mean distance of readings from the levels of digits, of white, that levels of another exponent leave, and least distance,
+from which on that exponent is named: noise, blur and bounced light leave more with any other."""
 DENSE = 0.8
 """Part of the neighbours with other bits that differ in one alone, from which on they lie in stripes side by side: stripes three apart may
 differ in one bit too."""
@@ -108,6 +111,13 @@ def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projecto
         clear = clear | also
         others.append(("red and blue are exchanged: check the order of the channels in the images", turned, code.reflected))
     lit = sample.lit(sample.grey, noise) & (deviation * CLEAR_SIGMAS < gap / 2)
+    if code.colors is None and projector.response is None and lit.sum() >= ENOUGH:
+        coarse = part[len(part) // 2 :, 0, lit, None]
+        away = {exponent: float(np.abs(coarse - levels[:, 0] ** exponent).min(axis=-1).mean()) for exponent in EXPONENTS}
+        bent = min(away, key=lambda exponent: away[exponent])
+        if away[bent] < BENT_LEFT * away[1.0] and away[1.0] > LEAST_BENT:
+            return (f"the digits of the {code.axis} kary code look like light = level^{bent:g}: give the light that is shown as levels, or "
+                    "measure projector.response with relit calibrate response; check color_space of the images too")
     read_well = np.flatnonzero(clear[: 1 + len(digits) // 2, lit].sum(axis=1) >= READ_SHARE * max(int(lit.sum()), 1))
     if not len(read_well):
         return None

@@ -32,12 +32,13 @@ ENOUGH = 300
 """Number of sampled pixels with signal below which nothing is concluded."""
 SMOOTH_PART, SMOOTH_SIGMAS = 0.02, 4.0
 """Neighbours agree where their depths differ by less than this part, or this many deviations."""
-DOUBTFUL_SHARE = 0.5
+DOUBTFUL_SHARE = 0.6
 """Share of the pixels with signal that agree with a neighbour, below which other readings of the manifest are tried."""
 NOISY_PART = 0.75
 """The same as a part of what the noise of the depths lets agree: ramps in weak light agree at a fifth of the pixels."""
-CLEAR_SHARE, CLEAR_TIMES = 0.4, 2.0
-"""Another reading is named where it makes at least this share agree, and this many times as many as declared."""
+CLEAR_SHARE, CLEAR_TIMES, SURE_SHARE = 0.4, 2.0, 0.9
+"""Another reading is named where it makes at least the first share agree, and this many times as many as declared, or the last share:
+exchanged levels of a plain code in base 4 leave half of the pixels, as a mirrored image does."""
 UNEVEN, LARGEST_STEP = 0.01, 0.05
 """Mean distance of neighbouring pixels in the projector, as a part of its extent, above which other readings are tried, and the distance
 that pixels which are farther apart count with."""
@@ -135,8 +136,16 @@ READINGS = (
             _changed(axis=lambda p: "row" if p.axis == "column" else "column")),
     Reading("the order of bits is reversed: check bit in the frames' patterns (bit 0 is the finest)",
             _changed(bit=lambda p: p.bits - 1 - p.bit)),
+    Reading("the order of digits is reversed: check digit in the frames' patterns (digit 0 is the finest)",
+            _changed(digit=lambda p: p.digits - 1 - p.digit)),
+    Reading("bright and dark levels of the digits are exchanged: check levels in the frames' patterns",
+            _changed(levels=lambda p: p.levels and p.levels[::-1])),
     Reading("the steps of the phases run backwards: check step in the frames' patterns",
             _changed(step=lambda p: -p.step % p.steps)),
+    Reading("the steps 0 and 1 of the phases are exchanged: check step in the frames' patterns",
+            _changed(step=lambda p: (1 - p.step) % p.steps)),
+    Reading("the steps 0 and 2 of the phases are exchanged: check step in the frames' patterns",
+            _changed(step=lambda p: (2 - p.step) % p.steps)),
     Reading("the images are in reverse order: check image in frames", lambda patterns: patterns[::-1]),
     Reading("the images are one frame late: check image in frames", lambda patterns: [*patterns[1:], patterns[0]]),
     Reading("the images are one frame early: check image in frames", lambda patterns: [patterns[-1], *patterns[:-1]]),
@@ -222,7 +231,7 @@ def check_declaration(sample: Sample, patterns: list[Pattern], projector: Patter
     readings = _other_readings(patterns, lambda other, mirrored: agreement(sample, other, projector, model, noise, device,
                                                                            mirrored=mirrored).share)
     best, chosen = max(readings, key=lambda found: found[0], default=(0.0, None))
-    if chosen is None or best < max(CLEAR_SHARE, CLEAR_TIMES * share):
+    if chosen is None or best < min(max(CLEAR_SHARE, CLEAR_TIMES * share), SURE_SHARE):
         return None
     return (f"frames: as declared, {100 * share:.0f} % of the pixels with signal agree with their neighbours; {100 * best:.0f} % do if "
             f"{chosen.words}")

@@ -22,11 +22,12 @@ from service.light_estimation.explanations import (
     grey_readings,
 )
 from service.light_estimation.lambertian import SHADOW, degrees_between, median_of, normal_equations
+from service.light_estimation.light_axes import LightAxes
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.lights.adapted import find_adapted
 from service.solve.lights.intensities import LEAST_GAIN as LEAST_ASKED
-from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
+from service.solve.lights.orientation import find_axes, find_inversion
 from service.solve.lights.placement import find_placement
 from service.solve.lights.turn import find_turn
 from stage.capture.capture import Capture

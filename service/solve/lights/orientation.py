@@ -1,12 +1,11 @@
 """Test whether the axes of the lights are those of the camera, from the surface that was solved with them.
 
 Mirrored or turned lights explain the images as well as the right ones. What tells them apart: a visible surface faces the camera, its
-slopes are those of one height (service.solve.lights.axes), and the outline and the cast shadows of what is not hollow
-(service.solve.lights.object_outline).
+slopes are those of one height (service.light_estimation.axes), and the outline and the cast shadows of what is not hollow
+(service.light_estimation.object_outline).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,20 +13,29 @@ from kernels.device import to_numpy
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
+from service.light_estimation.axes import Axes, sites, wrong_axes
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import FACING, Fit, degrees_between, fit_lambertian, median_of
+from service.light_estimation.lambertian import FACING, Fit, degrees_between, median_of
+from service.light_estimation.light_axes import (
+    CLEAR,
+    INVERSE,
+    INWARD,
+    Grid,
+    LightAxes,
+    SmallMap,
+    describe,
+    is_clear,
+    light_axes,
+    toward_viewer,
+)
+from service.light_estimation.object_outline import Outline, cast_shadows
 from service.solve.base.solution import Solution, SolveInput
-from service.solve.lights.axes import Axes, sites, wrong_axes
-from service.solve.lights.object_outline import EDGE, Outline, cast_shadows, outline
-from stage.capture.camera import Camera
 from stage.capture.point_lights import DistantLights
 
-MAP_SIZE, FIT_SIZE = 120, 64
-"""Pixels across the small map on which the outline and shadows are compared, and of the one whose readings are fitted anew."""
+MAP_SIZE = 120
+"""Pixels across the small map on which the outline and shadows are compared."""
 LEAST_LIGHTS = 4
 """Fewer lights may lie almost in a plane, and then most normals of noise face away."""
-CLEAR, CLEAR_PART = 0.4, 0.8
-"""An outline is clear where the mean outward component is above the first number, in the same direction on the second part of it."""
 SHADOW_PIXELS, SHADOW_LIGHTS = 2000, 64
 """Pixels and lights of which cast shadows are compared."""
 LEAST_COSINE, LEVEL_COSINE = 0.1, 0.25
@@ -47,24 +55,6 @@ more is enough. In right hollows at most 0.77 is lit, in white ones under three 
 one that is lit more."""
 LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
 """Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
-INVERSE = np.diag([-1.0, -1.0, 1.0])
-"""The turn by 180 degrees about the view axis."""
-
-
-class LightAxes(NamedTuple):
-    """A fault of the axes of the lights."""
-
-    sentence: str
-    matrices: tuple[np.ndarray, ...] = ()
-    """[3, 3], what corrects directions and normals: one, or two between which nothing decides; none where nothing is certain."""
-    degrees: float | None = None
-    """The error of the normals in degrees, where the solved ones are not turned with the lights."""
-
-
-class _Map(NamedTuple):
-    normal: np.ndarray  # [3, rows, cols] float32, z towards the viewer of each pixel; 0 outside
-    mask: np.ndarray  # [rows, cols] bool
-    pixels: np.ndarray  # [rows, cols] row-major positions in the image
 
 
 def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | None, fit: Fit | None) -> LightAxes | None:
@@ -76,11 +66,11 @@ def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | Non
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     positions = sites(estimated)
     flat = solution.normal[:, positions.reshape(-1)]
-    normals = np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0)
+    normals = np.moveaxis(toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0)
     found = wrong_axes(normals, strict=given.stack.light_count < MANY_LIGHTS)
     if found is None:
         return None
-    return _sentence(_choices(found, _map_of(given, solution.normal, estimated), np.eye(3)), found)
+    return light_axes(_map_of(given, solution.normal, estimated).corrections(found, np.eye(3)), found)
 
 
 def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights | None) -> LightAxes | None:
@@ -90,10 +80,10 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
     if not estimated.any():
         return None
     small = _map_of(given, solution.normal, estimated)
-    edge = outline(small.normal, small.mask)
+    edge = small.edge
     if edge.outward >= CLEAR:
         return None
-    inward, decided = _is_clear(edge), None
+    inward, decided = is_clear(edge), None
     if lights is not None:
         decided = _is_inverted(_Shadows(given, solution.normal, small, lights), edge, len(lights.direction))
     if decided:
@@ -101,21 +91,20 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
                          "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
     if decided is not None or not inward:
         return None
-    return LightAxes("along the outline the normals point inwards: the object is hollow there, or x and y of the lights are both negated "
-                     "(turned by 180° about the view axis); nothing else in the images decides")
+    return LightAxes(INWARD)
 
 
 def is_upright(given: SolveInput, lights: DistantLights, normals: Callable[[np.ndarray], np.ndarray]) -> bool | None:
     """Return whether the images have the cast shadows of a surface, or those of its inverse; None where they do not tell.
     `normals`: returns the normals [3, n] of pixels [n], seen by an orthographic camera."""
-    pixels, inside = _grid(given.mask, MAP_SIZE)
+    grid = Grid.of(given.mask, MAP_SIZE)
     normal = np.zeros((3, given.mask.size), np.float32)
-    found = normals(pixels[inside])
+    found = normals(grid.chosen)
     told = np.isfinite(found).all(axis=0)
-    inside[inside] = told
-    normal[:, pixels[inside]] = found[:, told]
-    small = _Map(np.where(inside, normal[:, pixels.reshape(-1)].reshape(3, *pixels.shape), 0), inside, pixels)
-    if not inside.any():
+    grid.inside[grid.inside] = told
+    normal[:, grid.chosen] = found[:, told]
+    small = SmallMap(np.where(grid.inside, normal[:, grid.pixels.reshape(-1)].reshape(3, *grid.pixels.shape), 0), grid)
+    if not told.any():
         return None
     shadows = _Shadows(given, normal, small, lights)
     (count, lit), (count_inverse, lit_inverse) = shadows.of_surface(), shadows.of_inverse()
@@ -129,7 +118,7 @@ def _is_inverted(shadows: "_Shadows", edge: Outline, lights: int) -> bool | None
 
     Many `lights` can contradict the surface by its own shadows; they do it alone where no outline speaks for the inversion.
     """
-    alone, many = not _is_clear(edge), lights >= MANY_LIGHTS
+    alone, many = not is_clear(edge), lights >= MANY_LIGHTS
     count, lit = shadows.of_surface()
     if count < (LEAST_SHADOWS_ALONE if alone else max(LEAST_SHADOWS, LEAST_SHADOWS_A_LIGHT * min(lights, SHADOW_LIGHTS))):
         return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
@@ -153,53 +142,36 @@ def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes 
     exchange = np.eye(3)
     exchange[[2, axis]] = exchange[[axis, 2]]
     exchange[2] *= sign
-    pixels, inside = _grid(given.mask, FIT_SIZE)
-    radiance, usable = given.stack.pick_radiance(pixels[inside])
-    fitted = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
-    normal = np.zeros((3, *pixels.shape), dtype=np.float32)
-    normal[:, inside] = _toward_viewer(given.camera, exchange @ fitted.normal, pixels[inside])
-    small = _Map(normal, inside, pixels)
-    positions = sites(small.mask)
-    found = wrong_axes(np.moveaxis(small.normal.reshape(3, -1)[:, positions], 1, 0)) or Axes(np.eye(2), 1 - fit.facing, 1 - share)
-    matrices = _choices(found, small, exchange)
+    grid = Grid.of(given.mask)
+    radiance, usable = given.stack.pick_radiance(grid.chosen)
+    small = SmallMap.fitted(given.camera, grid, grey_readings(radiance, lights.irradiance), usable, lights.direction, exchange)
+    found = small.wrong_axes() or Axes(np.eye(2), 1 - fit.facing, 1 - share)
+    matrices = small.corrections(found, exchange)
     if len(matrices) > 1:  # nothing decides: the smaller change is the likelier mistake
         matrices = (max(matrices, key=lambda matrix: float(np.trace(matrix))),)
     behind = (f"all {len(lights.direction)} lights are behind the object (z ≤ 0), and yet light what the camera sees"
               if (lights.direction[:, 2] <= 0).all() else f"{100 * (1 - fit.facing):.0f} % of the normals face away from the camera")
     turned = degrees_between(matrices[0] @ fit.normal, fit.normal)
-    return LightAxes(f"{behind}: with {_describe(matrices[0])}, {100 * share:.0f} % face it; check the axes (x right, y up, z towards the "
+    return LightAxes(f"{behind}: with {describe(matrices[0])}, {100 * share:.0f} % face it; check the axes (x right, y up, z towards the "
                      "camera)", matrices, float(np.median(turned)))
-
-
-def _choices(found: Axes, small: _Map, before: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the correction whose outline points outwards, of the one that was found and its inverse; both where nothing decides."""
-    matrix = np.eye(3)
-    matrix[:2, :2] = found.matrix
-    edge = outline(np.einsum("ij,jrc->irc", matrix, small.normal), small.mask)
-    both = (matrix @ before, INVERSE @ matrix @ before)
-    return (both[0 if edge.outward > 0 else 1],) if _is_clear(edge) else both
-
-
-def _is_clear(edge: Outline) -> bool:
-    part = edge.inward_part if edge.outward < 0 else 1 - edge.inward_part
-    return abs(edge.outward) >= CLEAR and part >= CLEAR_PART
 
 
 class _Shadows:
     """The cast shadows of a surface and of its inverse, compared with readings."""
 
-    def __init__(self, given: SolveInput, normal: np.ndarray, small: _Map, lights: DistantLights) -> None:
+    def __init__(self, given: SolveInput, normal: np.ndarray, small: SmallMap, lights: DistantLights) -> None:
         """Integrate a small map, and read some of its pixels under some of the lights.
         `normal`: [3, pixels of the image], known at those of the small map."""
-        rows, cols = small.mask.shape
+        mask = small.grid.inside
+        rows, cols = mask.shape
         across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
         self._height = to_numpy(integrate_normals(
-            small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
+            small.normal, mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
             options=IntegrationOptions(discontinuities=True), device=given.device).height)
-        surface = np.flatnonzero(small.mask)
-        self._mask, self._chosen = small.mask, surface[evenly(len(surface), SHADOW_PIXELS)]
+        surface = np.flatnonzero(mask)
+        self._mask, self._chosen = mask, surface[evenly(len(surface), SHADOW_PIXELS)]
         some = evenly(len(lights.direction), SHADOW_LIGHTS)
-        pixels = small.pixels.reshape(-1)[self._chosen]
+        pixels = small.grid.pixels.reshape(-1)[self._chosen]
         radiance, usable = given.stack.pick_radiance(pixels)
         readings = grey_readings(radiance[some], lights.irradiance[some])
         self._direction = lights.direction[some]
@@ -221,55 +193,6 @@ class _Shadows:
         return int(shadow.sum()), float(self._lit[shadow].mean()) if shadow.any() else 0.0
 
 
-def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return row-major positions [rows, cols] of every n-th pixel of the box around a mask, `size` across at most, and which are inside."""
-    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    step = max(1, -(-max(int(np.ptp(rows)), int(np.ptp(cols))) // size))
-    margin = step * (3 * size // EDGE + 2)  # of background, so that only the border of the image hides the outline
-    row, col = (np.arange(max(lines[0] - margin, 0), min(lines[-1] + margin + 1, count), step)
-                for lines, count in zip((rows, cols), mask.shape, strict=True))
-    return row[:, None] * mask.shape[1] + col, mask[np.ix_(row, col)]
-
-
-def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> _Map:
-    pixels, inside = _grid(mask, MAP_SIZE)
-    flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
-    return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)
-
-
-def _toward_viewer(camera: Camera, normal: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return normals [3, n] with the component towards each pixel's viewer as z: their slopes are those of the logarithm of depth."""
-    if camera.projection == "orthographic":
-        return normal
-    row, col = np.divmod(pixels, camera.width)
-    right, up = camera.plane_at(col + 0.5, row + 0.5)
-    turned = np.stack([normal[0], normal[1], normal[2] - normal[0] * right - normal[1] * up])
-    return np.asarray(turned / np.maximum(np.linalg.norm(turned, axis=0), 1e-12))
-
-
-def _sentence(matrices: tuple[np.ndarray, ...], found: Axes) -> LightAxes:
-    ways = ", or ".join(_describe(matrix) for matrix in matrices)
-    kind = "mirrored" if np.linalg.det(matrices[0]) < 0 else "turned"
-    return LightAxes(f"the axes look {kind}: with {ways}, the slopes of the surface are those of one height to {100 * found.left:.0f} %, "
-                     f"as declared to {100 * found.misfit:.0f} % (25 % is no order at all); check the axes (x right, y up, z towards the "
-                     "camera), and that no image is flipped", matrices)
-
-
-def _describe(matrix: np.ndarray) -> str:
-    """Return a correction of directions in words."""
-    whole = np.round(matrix)
-    if np.abs(matrix - whole).max() > 1e-6:
-        turn = np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))
-        mirrored = "y negated and then all " if np.linalg.det(matrix[:2, :2]) < 0 else "all "
-        return f"{mirrored}turned by {turn:.0f}° about the view axis (from x towards y)"
-    names = ["xyz"[int(np.argmax(np.abs(row)))] for row in whole]
-    signs = [row.sum() < 0 for row in whole]
-    if names == list("xyz"):
-        negated = [name for name, minus in zip(names, signs, strict=True) if minus]
-        if len(negated) == 3:
-            return "every direction negated (they seem to point from the light to the surface)"
-        return f"{' and '.join(negated)} negated"
-    moved = [name for name, own in zip(names, "xyz", strict=True) if name != own]
-    if len(moved) == 2 and not any(signs):
-        return f"{' and '.join(sorted(moved))} swapped"
-    return f"(x, y, z) read as ({', '.join(('-' if minus else '') + name for name, minus in zip(names, signs, strict=True))})"
+def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> SmallMap:
+    grid = Grid.of(mask, MAP_SIZE)
+    return SmallMap.of(given.camera, grid, normal[:, grid.chosen])

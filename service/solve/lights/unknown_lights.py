@@ -10,10 +10,11 @@ from scipy.optimize import minimize
 from kernels.photometric.model.samples import evenly
 from service.errors import RequestError
 from service.light_estimation.lambertian import SHADOW, bright_readings
+from service.light_estimation.light_axes import CLEAR, INVERSE, Grid
+from service.light_estimation.object_outline import outline
 from service.solve.base.solution import PIXELS_AT_ONCE, SolveInput
 from service.solve.lights.factorisation import factorise, fit_surface, integrable
-from service.solve.lights.object_outline import outline
-from service.solve.lights.orientation import INVERSE, is_upright
+from service.solve.lights.orientation import is_upright
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError
@@ -71,10 +72,6 @@ PLACES = 2000
 """Places, spread over the object, from which the lights are found."""
 STEP = 50.0
 """Slopes of the surface are differences over a fiftieth of the object on either side: noise decides over single pixels."""
-MAP_SIZE = 64
-"""Pixels across the small map whose outline is looked at."""
-CLEAR = 0.4
-"""Least mean outward component of the normals along the outline of an object that stands free, as in `orientation`."""
 QUARTERS = 4
 """Parts of the object, each of which is left out once to find the uncertainty."""
 HIGHLIGHT_DEGREES, ALBEDO_DEGREES = 2.0, 20.0
@@ -219,12 +216,10 @@ def _unit(b: np.ndarray) -> np.ndarray:
 
 def _outward(given: SolveInput, lights: np.ndarray, matrix: np.ndarray) -> float:
     """Return the mean outward component of the normals along the outline of the mask."""
-    every = max(1, int(np.ceil(_extent(given.mask) / MAP_SIZE)))
-    mask = given.mask[::every, ::every]
-    pixels = np.arange(given.mask.size).reshape(given.mask.shape)[::every, ::every][mask]
-    normal = np.zeros((3, *mask.shape))
-    normal[:, mask] = _unit(matrix @ fit_surface(*_read(given, pixels), lights))
-    return outline(normal, mask).outward
+    grid = Grid.of(given.mask)
+    normal = np.zeros((3, *grid.inside.shape))
+    normal[:, grid.inside] = _unit(matrix @ fit_surface(*_read(given, grid.chosen), lights))
+    return outline(normal, grid.inside).outward
 
 
 # The generalised bas-relief ambiguity of a factorised surface, resolved by its highlights, or by its albedo where it has none.

@@ -76,6 +76,26 @@ def test_distances_that_contradict_the_others_and_a_turned_target_are_said_and_t
 
 
 @pytest.mark.long
+def test_what_stands_before_the_target_is_left_out_and_said(tmp_path):
+    """A thing 10 cm before the target in a twelfth of every image: it pulled a wall to 8 mm off, at a sigma_m of 2 mm."""
+    def frames(view):
+        near = view.distance.copy()
+        near[4:8, 6:10] -= 0.1
+        return cw(view._replace(distance=near))
+
+    path = sweep(tmp_path, [(f"d{k}", depth, 0.04, None) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))], frames)
+    made = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
+    assert any("are off the plane of the target" in words and "mask of the target alone" in words for words in made.warnings)
+    _, maps, _ = run(write(tmp_path / "new", cw(wall(3.3, 0.04)), camera=CAMERA), calibration=tmp_path / "c.json")
+    assert abs(np.median(maps.depth[maps.mask]) - 3.3) < min(4e-3, 2 * made.calibration.sigma_m)
+    plan = json.loads(path.read_text())
+    depths = [step["depth_m"] for step in plan["steps"]]
+    path.write_text(json.dumps({**plan, "steps": [{**s, "depth_m": d} for s, d in zip(plan["steps"], depths[::-1], strict=True)]}))
+    with pytest.raises(RequestError, match=r"--signal of relit import tof.*fall where depth_m grows"):
+        calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
+
+
+@pytest.mark.long
 def test_distances_in_another_unit_or_scale_are_told(tmp_path, relit):
     steps = [(f"d{k}", depth, 0.0, None) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))]
     path = sweep(tmp_path, steps, cw)

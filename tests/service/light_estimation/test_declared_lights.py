@@ -12,6 +12,7 @@ from service.requests.basis import BasisRequest
 from service.requests.captures import InfoRequest
 from service.requests.relight import RelightRequest
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture, write_exr
+from tests.scenes.ellipsoid import ellipsoid
 
 SCENE = make_scene(size=32, lights=12)
 AXES = {"x": np.eye(3)[[2, 1, 0]], "y": np.eye(3)[[0, 2, 1]], "-z": -np.eye(3)}
@@ -37,6 +38,14 @@ def declared(folder, change, scene=SCENE):
 def test_axes_along_which_nothing_faces_the_camera_are_named(tmp_path, axis):
     for said in declared(tmp_path / "capture", lambda directions: directions @ AXES[axis]):
         assert len(said) == 1 and f"with {axis} as the axis towards the camera, 100 % face it" in said[0]
+
+
+@pytest.mark.parametrize(("signs", "words"), [([1, -1, 1], "the axes look mirrored: with y negated"),
+                                              ([-1, -1, 1], "along the outline the normals point inwards"), ([1, 1, 1], None)])
+def test_axes_under_which_the_normals_are_of_no_surface_that_stands_free_are_named(tmp_path, signs, words):
+    """Lights with y down, or turned by 180°, explain every reading of a matt object as well as the right ones."""
+    for said in declared(tmp_path / "capture", lambda directions: directions * signs, ellipsoid(count=12)):
+        assert said == [] if words is None else len(said) == 1 and words in said[0]
 
 
 def test_lights_in_another_order_are_named(tmp_path):

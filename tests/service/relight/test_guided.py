@@ -50,11 +50,12 @@ def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
 
 @pytest.mark.parametrize("wrong", ["normals", "gloss"])
 def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
-    """Normals turned away, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain sum's."""
+    """Normals that all face the camera, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain
+    sum's. Turned normals are refused."""
     folder, truth = scene
     if wrong == "normals":
-        turned = SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)
-        maps = write_maps(tmp_path / "maps", SURFACE, normal=turned.astype(np.float32))
+        flat = np.broadcast_to(np.float32([0, 0, 1]), SURFACE.normal.shape)
+        maps = write_maps(tmp_path / "maps", SURFACE, normal=flat)
     else:
         shape = SURFACE.mask.shape
         maps = write_maps(tmp_path / "maps", SURFACE, specular=np.full((*shape, 3), 0.9), roughness=np.full(shape, 0.12))
@@ -144,13 +145,15 @@ def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
     assert "another camera.pixel_size_m than" in relit(words[0], copy, *words[2:], "--out", tmp_path / "b.#.exr").out
 
 
-def test_maps_that_were_solved_with_other_lights_guide_with_a_warning(relit, scene, tmp_path):
+def test_maps_that_were_solved_with_other_lights_guide_and_are_exported_with_a_warning(relit, scene, tmp_path):
     """Lights that were corrected in the manifest after the solve; beside it the same lights."""
     folder = shutil.copytree(scene[0], tmp_path / "scene")
     assert relit("solve", folder / "cap", "--method", "lambert", "--out", folder / "solved").code == 0
     words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--maps", folder / "solved")
-    assert "other lights" not in relit(*words, "--out", tmp_path / "a.#.exr").out
+    asset = ("export", folder / "solved", "--rig", folder / "cap", "--out", tmp_path / "a.usda")
+    assert "other lights" not in relit(*words, "--out", tmp_path / "a.#.exr").out + relit.done(*asset).out
     frames = json.loads((folder / "cap" / "capture.json").read_text())["frames"]
     frames[0]["light"]["irradiance"] = [3.0, 3.0, 3.0]
     edit_manifest(folder / "cap", frames=frames)
     assert "solved with other lights than" in relit(*words, "--out", tmp_path / "b.#.exr").out
+    assert "solved with other lights than" in relit.done(*asset).out

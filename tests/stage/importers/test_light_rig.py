@@ -116,6 +116,14 @@ def test_a_dome_lights_images_in_their_order(folder, configuration, factor):
         assert np.allclose([light.position_m for light in lights], factor * DIR)
 
 
+@pytest.mark.parametrize("aligns", [[], [{"rect": [0, 0, 8, 8], "offsets": []}]])
+def test_images_that_a_project_aligns_are_said_to_be_as_they_are(folder, aligns):
+    images = [{"filename": name, "skip": False} for name in NAMES]
+    (folder / "coin.relight").write_text(json.dumps({"folder": ".", "images": images, "dome": dome(), "aligns": aligns}))
+    relightlab.import_folder(folder / "coin.relight", None)
+    assert any("lie on one another" in said for said in Capture.open(folder).manifest.assumed) == bool(aligns)
+
+
 def test_positions_without_a_width_are_directions(folder):
     (folder / "rig.dome").write_text(json.dumps(dome(lightConfiguration="lights3d", imageWidth=0)))
     relightlab.import_folder(folder, None)

@@ -105,20 +105,27 @@ def test_a_mirror_is_doubted(relit, tmp_path):
     assert (doubted & ~wrong).mean() < 0.005
 
 
-def changed(**fields):
+def changed(patterns=GRAY, **fields):
     """Patterns whose fields are changed by functions of themselves."""
-    return [p.model_copy(update={name: change(p) for name, change in fields.items() if hasattr(p, name)}) for p in GRAY]
+    return [p.model_copy(update={name: change(p) for name, change in fields.items() if hasattr(p, name)}) for p in patterns]
+
+
+DIGITS = kary_patterns(WIDTH, "column", base=3, reflected=False, stripe_px=4)
+WAVES = (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("declared", "words"), [
-    (changed(inverse=lambda p: not p.inverse), "patterns and inverses are exchanged"),
-    (changed(axis=lambda p: "row"), "columns and rows are exchanged"),
-    (changed(bit=lambda p: p.bits - 1 - p.bit), "the order of bits is reversed"),
-    (list(GRAY[::-1]), "the images are in reverse order"),
+@pytest.mark.parametrize(("patterns", "declared", "words"), [
+    (GRAY, changed(inverse=lambda p: not p.inverse), "patterns and inverses are exchanged"),
+    (GRAY, changed(axis=lambda p: "row"), "columns and rows are exchanged"),
+    (GRAY, changed(bit=lambda p: p.bits - 1 - p.bit), "the order of bits is reversed"),
+    (GRAY, list(GRAY[::-1]), "the images are in reverse order"),
+    (DIGITS, changed(DIGITS, levels=lambda p: p.levels[::-1]), "bright and dark levels of the digits are exchanged"),
+    (DIGITS, changed(DIGITS, digit=lambda p: p.digits - 1 - p.digit), "the order of digits is reversed"),
+    (WAVES, changed(WAVES, step=lambda p: {0: 2, 2: 0}.get(p.step, p.step)), "the steps 0 and 2 of the phases are exchanged"),
 ])
-def test_a_wrong_declaration_is_named(relit, tmp_path, light, declared, words):
-    write_capture(tmp_path, ROOM, GRAY, light=light, declared=declared)
+def test_a_wrong_declaration_is_named(relit, tmp_path, light, patterns, declared, words):
+    write_capture(tmp_path, ROOM, patterns, light=light, declared=declared)
     maps, *_ = solve(relit, tmp_path)
     assert not maps.mask.any()
     maps, report, _ = solve(relit, tmp_path, "--least-confidence", "0")
@@ -146,9 +153,8 @@ def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("patterns", [GRAY, kary_patterns(WIDTH, "column", base=3, reflected=False, stripe_px=4),
-                                      (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False)),
-                                      (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())])
+@pytest.mark.parametrize("patterns", [GRAY, DIGITS, WAVES,
+                                      (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False))])
 def test_right_captures_raise_no_alarm(relit, tmp_path, light, patterns):
     write_capture(tmp_path, ROOM, patterns, light=light)
     maps, report, out = solve(relit, tmp_path)

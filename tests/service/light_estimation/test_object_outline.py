@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.solve.lights.object_outline import cast_shadows, outline
+from service.light_estimation.object_outline import cast_shadows, outline
 from tests.scenes.ellipsoid import ellipsoid
 
 

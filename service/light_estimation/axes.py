@@ -3,7 +3,7 @@
 Light directions whose axes are mirrored or turned explain the images as well as the right ones: the normals are mirrored or turned
 with them. But a surface has a height, so its slopes p = dz/dx and q = dz/dy obey dp/dy = dq/dx. With M the derivatives of the
 slopes, a mirrored surface has dp/dy + dq/dx = 0 instead, and one that is turned by a right angle dp/dx + dq/dy = 0. A surface that
-is turned by 180 degrees obeys the first rule too: that is the ambiguity of convex and concave, for service.solve.lights.object_outline.
+is turned by 180 degrees obeys the first rule too: that is the ambiguity of convex and concave, for service.light_estimation.object_outline.
 
 Source: Horn, "Robot Vision", 1986, section 11.8, for integrability; Belhumeur, Kriegman and Yuille, IJCV 35(1), 1999, for what it
 leaves open.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.solve.lights.axes import LEAST_SITES, SITES, sites, wrong_axes
+from service.light_estimation.axes import LEAST_SITES, SITES, sites, wrong_axes
 from tests.scenes.ellipsoid import ellipsoid
 
 SCENE = ellipsoid()
