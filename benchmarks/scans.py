@@ -21,9 +21,10 @@ from benchmarks.file_mutations import write_between
 from service.scans.points.rigid import about, applied, inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.read import read_scan
-from service.scans.registration.registration import Registration, RegistrationOptions, register
+from service.scans.registration.registration import Registration
 from stage.results.depth_maps import DepthMaps
 from stage.sets.scan_set import ScanEntry, ScanSet, Turntable
+from tests.scenes.register import register
 from tests.scenes.turntable import MM, View, figure, pose, see
 
 CASES = {"18 scans, 20° apart": 18, "9 scans, 40° apart": 9, "6 scans, 60° apart": 6}
@@ -74,7 +75,7 @@ def line(case: str, method: str, views: list[View], poses: dict[int, np.ndarray]
 def timed(scans: list[Scan], starts: list[np.ndarray | None], table: Turntable | None = None) -> tuple[Registration, float]:
     """Register, and return the seconds of all processors together, which the load of the machine hardly changes."""
     began = time.process_time()
-    found = register(scans, starts, RegistrationOptions(threads=os.cpu_count() or 1), table=table)
+    found = register(scans, starts, threads=os.cpu_count() or 1, table=table)
     return found, time.process_time() - began
 
 
@@ -123,7 +124,7 @@ def trials(count: int, rows: int) -> str:
         for trial in range(count if len(angles) < 12 else max(count // 5, 2)):
             views = [see(figure, pose(angle), rows=rows, sigma=0.25 * MM, seed=1000 * trial + k) for k, angle in enumerate(angles)]
             starts: list[np.ndarray | None] = [view.world_from_scan for view in views]
-            found = register(scans_of(views), starts, RegistrationOptions(threads=os.cpu_count() or 1))
+            found = register(scans_of(views), starts, threads=os.cpu_count() or 1)
             for number, placed in found.poses.items():
                 if number == found.reference:
                     continue

@@ -20,6 +20,10 @@ class NoiseModel(NamedTuple):
     gain: float
     """Gain of photon noise: full scale divided by the electrons that fill a pixel."""
 
+    def variance(self, readings: np.ndarray) -> np.ndarray:
+        """Return the variance of readings of any shape."""
+        return self.read**2 + self.gain * np.maximum(readings, 0)
+
 
 def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
     """Refuse frames that do not exist or are taken twice, or images of another number of channels."""

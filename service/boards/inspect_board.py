@@ -121,7 +121,7 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
     if judged is None:
         return InspectBoardResult(request.out / BOARD_FILE, report_path, picture_path, None, None, [], [], None, heights, tuple(warnings))
     return InspectBoardResult(request.out / BOARD_FILE, report_path, picture_path, findings_path, judged.verdict, judged.defects,
-                              judged.regions, _share(judged), heights, tuple(warnings))
+                              judged.regions, float(judged.inspected.sum() / judged.wanted.sum()), heights, tuple(warnings))
 
 
 def _nominal(request: InspectBoardRequest) -> Nominal | None:
@@ -217,10 +217,6 @@ def _verdict(defects: list[Defect], regions: list[RegionResult], inspected: np.n
     if inspected.sum() < least * wanted.sum():
         verdicts.append(Verdict.NOT_INSPECTED)
     return Verdict.worst(verdicts)
-
-
-def _share(judged: _Judged) -> float:
-    return float(judged.inspected.sum() / judged.wanted.sum())
 
 
 def _write_deviation(path: Path, judged: _Judged, provenance: dict[str, str]) -> None:

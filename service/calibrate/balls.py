@@ -154,7 +154,8 @@ def find_mirror_balls(captures: LightCaptures, level: float, radius_m: float | N
     orthographic camera; None: not known."""
     found = _mirrors(captures, level, radius_m, z_m)
     if len(found.balls) < 2:
-        raise RequestError(f"{captures.source.folder}: {_counted(len(found.balls))} found in the images ({found.looked_at} round outlines "
+        counted = "no mirror ball is" if not found.balls else "1 mirror ball is"
+        raise RequestError(f"{captures.source.folder}: {counted} found in the images ({found.looked_at} round outlines "
                            "were looked at), and near lights need two or more: name them with --ball U,V,R or --ball-mask FILE, once each")
     return found.balls
 
@@ -179,10 +180,6 @@ def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m:
         return len(frames) == 1 or float(np.hypot(*np.std(places, axis=0))) > LEAST_MOVE * ball.radius_px
 
     return _find(captures, is_mirror, radius_m, z_m)
-
-
-def _counted(count: int) -> str:
-    return "no mirror ball is" if count == 0 else f"{count} mirror ball is"
 
 
 def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float | None) -> Ball:

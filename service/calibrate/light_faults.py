@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.calibrate.results import LightCaptures, MeasuredLight
-from service.calibrate.solvers.apply import LitFrame
 from service.calibrate.solvers.mirror_ball import MISSES
 from service.calibrate.solvers.saturation_level import clipped_level
 from service.light_estimation.ball import Ball, BallView
@@ -51,17 +50,14 @@ def at_one_place(captures: LightCaptures, results: Sequence[MeasuredLight]) -> l
     pairs = []
     for number, later in enumerate(captures.lit):
         for earlier, one in zip(captures.lit[:number], results, strict=False):
-            if _one_setting(earlier, later) and _one_place(one, results[number]):
+            alike = earlier.frame.exposure_s == later.frame.exposure_s and earlier.light.polarization == later.light.polarization
+            if alike and _one_place(one, results[number]):
                 pairs.append(f"{later.frame.image} as {earlier.frame.image}")
                 break
     if not 0 < 2 * len(pairs) < len(results):
         return []
     return [f"frames: the lamp stands at one place in {_listed(pairs)}: one image is a copy of the other, or the lamp did not change; the "
             "light of one of them is wrong"]
-
-
-def _one_setting(one: LitFrame, other: LitFrame) -> bool:
-    return one.frame.exposure_s == other.frame.exposure_s and one.light.polarization == other.light.polarization
 
 
 def _one_place(one: MeasuredLight, other: MeasuredLight) -> bool:

@@ -15,8 +15,8 @@ from service.calibrate.solvers.bundle import Certainty
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, first_alike, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.patterns import decoded_bands, read_codes
+from service.depth.patterns.readings import full_scale, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
 from service.requests.depth import DepthRequest

@@ -117,7 +117,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
         warnings.append(f"{request.design}: at {design.turned_edges} edges its faces turn their fronts opposite ways: points at faces that "
                         "are turned inward are not compared; make its normals consistent")
     timings.stage("write", 1)
-    span = span_of(found)
+    span = max(float(np.percentile(np.abs(found.distance), FULL_COLOUR)), 1e-12)  # the deviation that has the full colour, metres
     colours = colours_of(found, span)
     deviations_path, picture_path, report_path = (request.out / name for name in (DEVIATIONS_FILE, PICTURE_FILE, REPORT_FILE))
     _write_ply(deviations_path, scan, found, sigma, colours)
@@ -244,11 +244,6 @@ def _write_ply(path: Path, scan: ScannedSurface, found: Deviations, sigma: np.nd
             entries = np.empty(len(scan.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
             entries["count"], entries["corners"] = 3, scan.faces
             entries.tofile(stream)
-
-
-def span_of(found: Deviations) -> float:
-    """Return the deviation that has the full colour, metres."""
-    return max(float(np.percentile(np.abs(found.distance), FULL_COLOUR)), 1e-12)
 
 
 def colours_of(found: Deviations, span_m: float) -> np.ndarray:

@@ -8,15 +8,13 @@ import numpy as np
 from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.status import SOLVED
-from kernels.tof.histogram.pileup import correct_pileup, place, without_pileup
-from kernels.tof.histogram.pulse_width import estimate_pulse
+from kernels.tof.histogram.pileup import checked
 from kernels.tof.histogram.returns import find_returns
-from kernels.tof.histogram.undeclared_pileup import estimate_pulses
 from service.asset.usd.depth_asset import write_points
 from service.depth.base.solution import srgb_bytes, white_of
 from service.depth.passes import compare_passes
 from service.depth.tof.count_scale import estimate_count_scale
-from service.depth.tof.histograms import pile_up_warning, scale_warnings
+from service.depth.tof.histograms import live_photons, scale_warnings
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -25,7 +23,9 @@ from stage.files import write_text
 from stage.formats.las import LAS_FILE, las_is_installed, write_las
 from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
 from stage.stack.fingerprint import Fingerprints
+from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import range_of_delay_m
+from stage.tof.raw_frames import Histograms
 from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 
 USD_FILE = "points.usdc"
@@ -118,19 +118,14 @@ def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndar
         return index, shots.range_m[index], shots.intensity[index], {"ranges": "as recorded"}, []
     waveforms = shots.scan.waveforms
     assert waveforms is not None
-    place(shots.waveforms, device)  # faults of the counts come before those of what is estimated from them
+    checked(shots.waveforms)  # faults of the counts come before those of what is estimated from them
     scale = estimate_count_scale(shots.waveforms)
     warnings = scale_warnings(scale)
     photons = (shots.waveforms / np.float32(scale.units)).astype(np.float32)
-    counts = place(photons, device)
-    histograms = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else without_pileup(counts)
-    shape = estimate_pulse(histograms, photons)
-    if not waveforms.first_photon_only:
-        pile_up = estimate_pulses(photons, shape.pulse, device, lambda some, seen: estimate_pulse(some, seen).pulse)
-        if pile_up is not None:
-            warnings.append(pile_up_warning(pile_up))
-            histograms = correct_pileup(counts, pulses=pile_up.pulses)
-            shape = estimate_pulse(histograms, photons)
+    recorded = Histograms(shots.waveforms, waveforms.bin_s, waveforms.start_s, waveforms.pulses if waveforms.first_photon_only else None,
+                          waveforms.first_photon_only)
+    count, bins = photons.shape
+    histograms, shape, _ = live_photons(recorded, photons, TofCalibration(), np.zeros(bins, bool), np.ones(count, bool), device, warnings)
     found = find_returns(histograms, shape.pulse, most=MOST_RETURNS)
     there = (to_numpy(found.photons) > 0) & np.isin(to_numpy(found.status), SOLVED)
     number, index = np.nonzero(there)

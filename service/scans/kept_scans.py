@@ -140,7 +140,8 @@ class KeptScans:
 
     def rows(self, pair: Pair) -> Rows:
         """Return the matched points of a pair."""
-        return unpacked_rows(self._pair_files[pair.a, pair.b]())
+        with np.load(io.BytesIO(self._pair_files[pair.a, pair.b]()), allow_pickle=False) as found:
+            return Rows(*(found[f"rows_{name}"] for name in ROWS))
 
     def scan(self, number: int) -> Scan:
         """Read a scan; its normals are those of its file, or not there."""
@@ -256,9 +257,3 @@ def unpacked_pair(content: bytes) -> Pair:
             numbers = {name: float(value) for name, value in values.items() if value.ndim == 0}
             fit = Fit(**(values | numbers | {"matches": int(numbers["matches"]), "rows": None}))
     return Pair(**(known | {"state": PairState(known["state"]), "by": Evidence(known["by"]), "fit": fit}))
-
-
-def unpacked_rows(content: bytes) -> Rows:
-    """Return the rows of a pair of `packed_pair`."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as found:
-        return Rows(*(found[f"rows_{name}"] for name in ROWS))

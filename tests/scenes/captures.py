@@ -130,11 +130,16 @@ def distant(direction: np.ndarray, irradiance: float | np.ndarray) -> dict[str, 
 
 def write_images(folder: Path, images: Iterable[np.ndarray], entries: Iterable[dict[str, Any]], names: str = "{:03d}.exr"
                  ) -> list[dict[str, Any]]:
-    """Write images [rows, cols, 3] or grey [rows, cols], and return the frames of the manifest: their entries with their names."""
+    """Write images [rows, cols, 3] or grey [rows, cols], and return the frames of the manifest: their entries with their names.
+    Files whose names end with .png have 16 bits, of values from 0 to 1."""
     frames = []
     for index, (image, entry) in enumerate(zip(images, entries, strict=True)):
-        write_exr(folder / names.format(index), image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
-        frames.append({"image": names.format(index), **entry})
+        path = folder / names.format(index)
+        if path.suffix == ".png":
+            write_image(path, np.rint(np.clip(image, 0, 1) * 65535).astype(np.uint16))
+        else:
+            write_exr(path, image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
+        frames.append({"image": path.name, **entry})
     return frames
 
 

@@ -1,14 +1,18 @@
 """Synthetic captures for depth with a known truth: a sphere before a tilted plane under a projector or a laser, its images computed from
 exact geometry in float64 and written with OpenImageIO, OpenEXR and json alone."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import shift
 
+from service.depth.depth import DepthResult, depth
+from service.depth.patterns.pattern_checks import Sample
+from service.requests.depth import DepthRequest
 from tests.reference import projector as reference
-from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import write_images, write_manifest
 
 CAMERA = reference.Device(96, 72, 140.0, (-0.12, 0.03, 0.0), (0.001, -0.0015))
 PROJECTOR = reference.Device(128, 96, 150.0, (-0.15, 0.04, -0.01), (0.002, -0.001))
@@ -120,21 +124,41 @@ BLACK_WHITE = [{"code": "black"}, {"code": "white"}]
 def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *, suffix: str = "png", noise: float = 0.0,
                    level: float = 0.8, gamma: float = 1.0, seed: int = 7, **changes: Any) -> Path:
     """A capture of these patterns: 16-bit PNG, or float EXR, with ambient light and noise."""
-    rng = np.random.default_rng(seed)
-    frames = []
-    for number, pattern in enumerate(patterns):
+    rng, images = np.random.default_rng(seed), []
+    for pattern in patterns:
         light = shown(pattern, scene.uv) ** gamma
         light = light * ~(scene.shaded if light.ndim == 2 else scene.shaded[..., None])
         image = scene.albedo * (level * (light if light.ndim == 3 else light[..., None]) + AMBIENT)
-        image = np.clip(image + rng.normal(0, noise, image.shape[:2])[..., None], 0, 1) if noise else image
-        name = f"{number:02d}.{suffix}"
-        if suffix == "png":
-            write_image(folder / name, np.rint(image * 65535).astype(np.uint16))
-        else:
-            write_exr(folder / name, image)
-        frames.append({"image": name, "pattern": pattern})
-    write_manifest(folder, manifest(frames, **changes))
+        images.append(np.clip(image + rng.normal(0, noise, image.shape[:2])[..., None], 0, 1) if noise else image)
+    write_manifest(folder, manifest(write_images(folder, images, entries_of(patterns), f"{{:02d}}.{suffix}"), **changes))
     return folder
+
+
+def depth_of(folder: Path, **options: Any) -> DepthResult:
+    """What relit depth makes of a capture."""
+    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", **options))
+
+
+def grey_light(scene: Scene, patterns: list[dict[str, Any]], *, ambient: float = AMBIENT,
+               response: Callable[[np.ndarray], np.ndarray] = lambda level: level) -> np.ndarray:
+    """[frames, rows, cols] of the green light under patterns, which a projector shows with this response."""
+    level = response(np.array([shown(pattern, scene.uv) for pattern in patterns]))
+    return scene.albedo[..., 1] * (0.8 * level * ~scene.shaded + ambient)
+
+
+def sample_of(frames: np.ndarray, full: float = np.inf) -> Sample:
+    """Grey frames [frames, rows, cols] as a sample of pixels whose lines of sight nobody asks for; readings of `full` are saturated."""
+    values, still = frames.reshape(len(frames), 1, -1), np.zeros(frames.shape[1:], np.float32)
+    saturated = (values >= full)[:, 0] if np.isfinite(full) else None
+    return Sample(np.minimum(values, full).astype(np.float32), saturated, still, still, np.ones(still.shape, bool))
+
+
+def depth_under(folder: Path, patterns: list[dict[str, Any]], light: np.ndarray, *, noise: float = 0.003, seed: int = 4,
+                changes: dict[str, Any] | None = None, **options: Any) -> DepthResult:
+    """What relit depth makes of grey images of this light, with noise, which are declared to show patterns; `changes`: of the manifest."""
+    images = light + np.random.default_rng(seed).normal(0, noise, light.shape)
+    write_manifest(folder, manifest(write_images(folder, images, entries_of(patterns), "{:02d}.exr"), **(changes or {})))
+    return depth_of(folder, **options)
 
 
 def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, width: float, noise: float = 0.0, ambient: bool = True,
@@ -143,9 +167,7 @@ def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, wi
     """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray; `undeclared` are second planes of the
     frames that the manifest does not name; `levels`: steps between black and white, None for floats; `aside`:
     by how many pixels each laser frame lies farther right, None: not at all."""
-    rng = np.random.default_rng(3)
-    frames = []
-    points = scene.points
+    rng, images, points = np.random.default_rng(3), [], scene.points
     for number, laser in enumerate([*lasers, *([None] if ambient else [])]):
         glow = np.zeros(points.shape[:2])
         if laser is not None and laser["type"] == "plane":
@@ -163,8 +185,7 @@ def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, wi
         if aside is not None and laser is not None:
             image = shift(image, (0, aside[number], 0), order=1, mode="nearest")
         image = np.maximum(image + rng.normal(0, noise, image.shape), 0) if noise else image
-        image = np.round(image * levels) / levels if levels is not None else image
-        write_exr(folder / f"{number:03d}.exr", image)
-        frames.append({"image": f"{number:03d}.exr", **({"laser": laser} if laser is not None else {"light": {"type": "off"}})})
-    write_manifest(folder, manifest(frames, None, **changes))
+        images.append(np.round(image * levels) / levels if levels is not None else image)
+    entries = [*({"laser": laser} for laser in lasers), *([{"light": {"type": "off"}}] if ambient else [])]
+    write_manifest(folder, manifest(write_images(folder, images, entries), None, **changes))
     return folder

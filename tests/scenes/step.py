@@ -1,12 +1,11 @@
 """A block on a flat base under the planes of a laser: images from exact geometry in float64, with the shadow of the block."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tests.reference import projector as reference
-from tests.scenes.captures import write_exr, write_manifest
+from tests.scenes.captures import write_images, write_manifest
 from tests.scenes.depth import entry_of
 
 CAMERA = reference.Device(480, 360, 480.0, (-0.05, 0.02, 0.0), (0.001, -0.001))
@@ -84,12 +83,10 @@ def photograph(folder: Path, step: Step, planes: list[np.ndarray], *, noise: flo
     clear = ~step.shaded(points)
     off = points - step.place
     texture = 1 + 0.15 * np.sin(90 * (off @ np.cross(step.normal, step.facing))) * np.cos(70 * (off @ step.facing + off @ step.normal))
-    frames: list[dict[str, Any]] = []
-    for number, normal in enumerate([*planes, None] if even else planes):
+    images, entries = [], [*([{"laser": PLACEHOLDER}] * len(planes)), *([{"light": {"type": "off"}}] if even else [])]
+    for normal in [*planes, None] if even else planes:
         glow = 0.0 if normal is None else 0.7 * clear * np.exp(-(((points - LASER) @ normal) ** 2) / (2 * WIDTH**2))
-        image = 0.6 * texture * (0.1 + glow) + random.normal(0, noise, points.shape[:2])
-        write_exr(folder / f"{number}.exr", np.repeat(np.maximum(image, 0)[..., None], 3, axis=2))
-        frames.append({"image": f"{number}.exr", **({"light": {"type": "off"}} if normal is None else {"laser": PLACEHOLDER})})
+        images.append(np.maximum(0.6 * texture * (0.1 + glow) + random.normal(0, noise, points.shape[:2]), 0))
     write_manifest(folder, {"schema": "relit.capture/1", "name": "step", "camera": {"projection": "perspective", **entry_of(CAMERA)},
-                            "frames": frames})
+                            "frames": write_images(folder, images, entries, "{}.exr")})
     return folder

@@ -223,7 +223,9 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
         normal = (rows * weight) @ rows.T
         if int(clear.sum()) < LEAST_CLEAR:
             normal[LATERAL], normal[:, LATERAL] = 0, 0
-        solution = -np.linalg.lstsq(_scaled(normal), (rows * weight) @ residual / _diagonal(normal), rcond=1e-10)[0] / _diagonal(normal)
+        size = np.sqrt(np.diag(normal))
+        size = np.where(size > 0, size, 1)
+        solution = -np.linalg.lstsq(normal / np.outer(size, size), (rows * weight) @ residual / size, rcond=1e-10)[0] / size
     left = residual + solution @ rows
     kept = weight > 0
     quiet = kept & (edges == 0)
@@ -269,16 +271,6 @@ def robust_range(values: np.ndarray) -> float:
     """Return a quarter of the span from the 2nd to the 98th percentile, which is σ of a normal distribution within 3 %."""
     low, high = np.percentile(values, [2, 98])
     return float(high - low) / 4.1
-
-
-def _diagonal(normal: np.ndarray) -> np.ndarray:
-    diagonal = np.sqrt(np.diag(normal))
-    return np.where(diagonal > 0, diagonal, 1)
-
-
-def _scaled(normal: np.ndarray) -> np.ndarray:
-    diagonal = _diagonal(normal)
-    return np.asarray(normal / np.outer(diagonal, diagonal))
 
 
 def _shared(field: np.ndarray, variance: float) -> float:

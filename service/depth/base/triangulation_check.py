@@ -9,7 +9,7 @@ from stage.capture.projector import Projector
 from stage.errors import ManifestError
 
 LEAST_BASELINE_M, MOST_BASELINE_M = 1e-4, 20.0
-"""The range of plausible distances between camera and projector: outside it the translation is not in metres."""
+"""The range of plausible distances between camera and projector, or two cameras: outside it the translation is not in metres."""
 GRID = 9
 """The lines of sight in each direction and the depths in each decade that are searched for a point that camera and projector both see."""
 
@@ -39,16 +39,19 @@ def check_projector(capture: Capture) -> Projector:
     if missing is not None or not isinstance(projector, Projector):
         raise ManifestError(missing or where)
     baseline = float(np.linalg.norm(np.array(projector.camera_from_projector)[:3, 3]))
-    if baseline < LEAST_BASELINE_M:
-        raise ManifestError(f"{where}.camera_from_projector: the projector stands {baseline:.2g} m from the camera: "
-                            "without a baseline there is no depth")
-    if baseline > MOST_BASELINE_M:
-        raise ManifestError(f"{where}.camera_from_projector: the projector stands {baseline:.4g} m from the camera: "
-                            "give the translation in metres")
+    check_baseline(baseline, f"{where}.camera_from_projector: the projector", "the camera")
     if not _see_a_common_point(capture.camera, projector):
         raise ManifestError(f"{where}.camera_from_projector: the projector lights nothing that the camera sees: "
                             "both look along their -z, +y is up")
     return projector
+
+
+def check_baseline(baseline_m: float, device: str, other: str) -> None:
+    """Check that two devices stand at a plausible distance. `device`: the field and the device, `other`: the other, for messages."""
+    if baseline_m < LEAST_BASELINE_M:
+        raise ManifestError(f"{device} stands {baseline_m:.2g} m from {other}: without a baseline there is no depth")
+    if baseline_m > MOST_BASELINE_M:
+        raise ManifestError(f"{device} stands {baseline_m:.4g} m from {other}: give the translation in metres")
 
 
 def _see_a_common_point(camera: Camera, projector: Projector) -> bool:

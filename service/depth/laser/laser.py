@@ -119,7 +119,8 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         advice = _second_stripes(doubled, len(frames)) if doubled else (
             "check that the laser is seen, that origin_m, point_m and directions are in metres in the camera frame, and --near-m and "
             "--far-m")
-        raise ManifestError(f"{capture.folder}: no laser frame has a depth ({_words(seen)}): {advice}")
+        words = ", ".join(f"{count} {name}" for name, count in seen.items()) or "none was seen"
+        raise ManifestError(f"{capture.folder}: no laser frame has a depth ({words}): {advice}")
     timings.stage("map", 1)
     solution = _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
     if "sweeps_differ_m" not in solution.facts and any(plane.accuracy_deg is None for along in kept for plane in _planes(capture, along)):
@@ -266,10 +267,6 @@ def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSam
         method=kind, depth=depth, status=status, sigma=sigma, confidence=confidence, range_m=along_ray, amplitude=amplitude,
         colour=np.repeat(brightest[..., None], 3, axis=-1), points=np.concatenate(points), pixels=np.concatenate(pixels), facts=facts,
         warnings=warnings)
-
-
-def _words(seen: Counter[str]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in seen.items()) or "none was seen"
 
 
 def _check_laser(capture: Capture) -> None:

@@ -96,7 +96,7 @@ def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projecto
     white, black = light[collected.white], light[collected.black]
     contrast = np.maximum(white - black, 1e-9)
     part = (light[list(code.frames)] - black) / contrast
-    deviation = (np.sqrt(2 * noise.read**2 + 2 * noise.gain * np.maximum(white, 0)) / contrast).max(axis=0)
+    deviation = (np.sqrt(2 * noise.variance(white)) / contrast).max(axis=0)
     gap = min(float(np.abs(one - other).max()) for one, other in combinations(levels, 2))
 
     def read(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -306,7 +306,7 @@ def _check_waves(sample: Sample, stripes: Stripes, code: BinaryCode, collected: 
         readings = sample.grey[list(frames)]
         _, along, across = weights(np.array(shifts), period).T @ readings
         swing = np.hypot(along, across)
-        good = known.ravel() & (swing > CLEAR_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(readings.mean(axis=0), 0)))
+        good = known.ravel() & (swing > CLEAR_SIGMAS * np.sqrt(noise.variance(readings.mean(axis=0))))
         if good.sum() < ENOUGH:
             continue
         some = np.flatnonzero(good)[:: max(1, int(good.sum()) // SOME)]

@@ -4,7 +4,7 @@ A code is read without any calibration: the projector's column and row that each
 devices are calibrated and images are warped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from kernels.device import to_numpy
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from service.depth.base.solution import PixelSolution, statistics
+from service.depth.patterns.decoders import AxisDecoder
 from stage.capture.camera import Camera
 from stage.model import Resolution
 from stage.results.depth_maps import CoordinateMaps
@@ -81,6 +82,16 @@ class Coordinates:
             axis.status[band] = np.where(mask, status, int(Status.UNSOLVED))
         swings = [to_numpy(found.amplitude)[:mask.size].reshape(shape) for found in decoded if found is not None]
         self.amplitude[band] = np.where(mask, np.minimum.reduce(swings), 0)
+
+    def widen(self, decoders: Sequence[AxisDecoder | None], off: Callable[[AxisMaps, AxisDecoder], np.ndarray | None]) -> np.ndarray:
+        """Add what is no noise to the deviations of both axes; return the factor by which that widens the depth's, [rows, cols].
+        `decoders`: of columns and of rows. `off`: by how much the places of an axis may be off, [rows, cols] projector pixels, or None."""
+        wider = np.ones_like(self.amplitude)
+        for decoder, axis in zip(decoders, (self.columns, self.rows), strict=True):
+            found = None if decoder is None or axis is None else off(axis, decoder)
+            if found is not None and axis is not None:
+                wider = np.maximum(wider, axis.widen(found))
+        return wider
 
     def status(self) -> np.ndarray:
         """Return one status for each pixel, [rows, cols] uint8: that of the first axis which is not solved."""

@@ -115,15 +115,15 @@ class Lags(NamedTuple):
 
 def widen_lagging(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
                   noise: NoiseModel) -> tuple[list[str], np.ndarray]:
-    """Add to the deviations of places what light below surfaces makes; return what is said of it, and the factor by which that widens the
-    depth's, [rows, cols]. `decoders`: of columns and of rows."""
-    said, wider = [], np.ones_like(coordinates.amplitude)
-    for decoder, axis in zip(decoders, (coordinates.columns, coordinates.rows), strict=True):
-        found = None if decoder is None or axis is None else find_lag(planes, axis, decoder, collected, noise)
-        if found is not None:
-            assert axis is not None and decoder is not None
-            wider = np.maximum(wider, axis.widen(found.sigma))
-            said += found.sentences(decoder.axis)
+    """Add to the deviations of places what light below surfaces makes; return what is said of it, and the factor of `Coordinates.widen`."""
+    said: list[str] = []
+
+    def off(axis: AxisMaps, decoder: AxisDecoder) -> np.ndarray | None:
+        found = find_lag(planes, axis, decoder, collected, noise)
+        said.extend(() if found is None else found.sentences(decoder.axis))
+        return None if found is None else found.sigma
+
+    wider = coordinates.widen(decoders, off)
     return said, wider
 
 

@@ -1,9 +1,10 @@
 """Levels that no pattern has: frames that mix two patterns, and surfaces that move between frames.
 
-A pattern and its inverse add up to even light, and so does a wave over its shifts, whatever is seen and however blurred it is. Where these
-sums differ between the bits of a code, or between the periods of its waves, frames of one pixel do not show one scene under the patterns
-that are declared: the camera has recorded parts of two patterns, or the surface has moved. Wide stripes of a Gray code that are neither
-dark nor bright tell the same.
+A pattern and its inverse add up to even light, and so do a wave over its shifts, and white and black: to parts of white that are the same
+at all pixels, whatever is seen, however blurred it is and whatever the projector's response. Where these sums differ between the bits of a
+code, or between the periods of its waves, frames of one pixel do not show one scene under the patterns that are declared: the camera has
+recorded parts of two patterns, or the surface has moved. Wide stripes of a Gray code that are neither dark nor bright tell the same.
+Where a sum is another part of white than at other pixels, another surface was seen, or an edge or a texture has passed.
 """
 
 from collections.abc import Sequence
@@ -16,12 +17,14 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from kernels.structured.response import bent_wave, fitted_curve
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.pattern_checks import ENOUGH, LIT_SIGMAS, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, FULL_PART, LIT_SIGMAS, Sample
+from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Code, Collected
 from stage.patterns.kary import KaryCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.patterns.ramp import RampCode
+from stage.stack.planes import Planes
 
 HALVES = np.array([0.5, 0.5])
 """Weights of two frames in their mean."""
@@ -38,7 +41,11 @@ COARSE = 0.5
 """Part of the bits, the coarsest, that are looked at: blur and texture do not reach far into their stripes."""
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
-
+MOVED_SIGMAS, MOVED_PART = 6.0, 0.04
+"""Least difference of a sum from its usual part of white, in deviations of noise and in white, from which on a surface has moved: lamps
+flicker by less."""
+MOST_MOVED, SAID = 0.2, 0.005
+"""Parts of the compared pixels above which it is no motion of single things, and from which on it is said."""
 UNKNOWN_RESPONSE = ("; if the projector is far from linear, measure it with relit calibrate response, for waves of three steps look so "
                     "too then")
 """What is said besides of waves of three steps where no response is declared."""
@@ -74,7 +81,7 @@ class EvenLevels(NamedTuple):
                 if len(wave.frames) >= FULL_STEPS:
                     means.extend(fitted_curve(light, weights(np.array(wave.shifts), wave.period_px), np.array(wave.shifts))[1])
         several = len(pairs) > 1
-        return cls(np.stack([row_of(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
+        return cls(np.stack([row_of(frames, two, HALVES) for two in pairs]) if several else None,
                    np.stack(waves) if len(waves) > 1 else None,
                    np.stack([row_of(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None,
                    float(np.ptp(means)) if means else 0.0)
@@ -89,7 +96,7 @@ class EvenLevels(NamedTuple):
         whole = np.ptp(grey, axis=0)
 
         def clear(away: np.ndarray, rows: np.ndarray, level: np.ndarray, part: float) -> np.ndarray:
-            variance = 2 * float((rows**2).sum(axis=1).max()) * (noise.read**2 + noise.gain * np.maximum(level, 0))
+            variance = 2 * float((rows**2).sum(axis=1).max()) * noise.variance(level)
             return np.asarray(away > np.maximum(CLEAR_SIGMAS * np.sqrt(variance), part * whole))
 
         if self.waves is not None:
@@ -111,7 +118,7 @@ def between(grey: np.ndarray, collected: Collected, noise: NoiseModel) -> np.nda
         if isinstance(code, BinaryCode) and code.name == "gray" and code.inverses is None:
             bits = grey[list(code.frames)]
             dark, bright = bits.min(axis=0), bits.max(axis=0)
-            lit = bright - dark > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(bright, 0))
+            lit = bright - dark > LIT_SIGMAS * np.sqrt(noise.variance(bright))
             even = [grey[number] for number in (collected.white, collected.black) if number is not None]
             parts = (np.stack([*bits[-ceil(COARSE * len(bits)):], *even]) - dark) / np.maximum(bright - dark, 1e-12)
             found |= lit & (((parts > BETWEEN[0]) & (parts < BETWEEN[1])).sum(axis=0) >= SEVERAL)
@@ -160,3 +167,84 @@ def check_levels(sample: Sample, collected: Collected, projector: PatternProject
             "and their inverses, or waves over their shifts, do not add up to the same light): the camera has recorded parts of two "
             "patterns, or what it sees has moved: wait longer for each pattern, or synchronise projector and camera"
             f"{UNKNOWN_RESPONSE if unknown else ''}")
+
+
+class EvenSums(NamedTuple):
+    """Sums of the frames that are even light."""
+
+    rows: np.ndarray  # [sums, frames]
+    usual: np.ndarray  # [sums] parts of white, less black
+    white: int
+    black: int
+    full: float
+    """Reading of a channel from which on it may be clipped, whatever the manifest says."""
+    everywhere: bool = False
+    """True if bits and their inverses differ at more pixels than what moves before a wall would make them."""
+
+    @classmethod
+    def of(cls, sample: Sample, collected: Collected, noise: NoiseModel) -> "EvenSums | None":
+        """Return the sums of a capture that has bits with inverses, white and black, with waves or without; None of another, or if waves
+        differ at more pixels than motion would make: those of a camera that is not linear do, and stripes of it do not."""
+        if collected.white is None or collected.black is None:
+            return None
+        frames = len(sample.values)
+        rows = [row for code in collected.codes if isinstance(code, BinaryCode) for row in even_means(code, frames)]
+        bits = len(rows)
+        rows += [row for code in collected.codes if isinstance(code, PhaseCode) for row in even_means(code, frames)]
+        if not bits:
+            return None
+        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black,
+                    FULL_PART * float(sample.values.max(initial=0.0)))
+        lit = sample.whole & found.lit(sample.grey, noise)
+        if lit.sum() < ENOUGH:
+            return None
+        part, _ = found.parts(sample.grey[:, lit], noise)
+        found = found._replace(usual=np.median(part, axis=1))
+        if found.moved(sample, noise)[lit].mean() <= MOST_MOVED:
+            return found
+        return found._replace(everywhere=True) if len(rows) == bits else None
+
+    def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return which pixels are compared, of readings [frames, pixels]."""
+        spread = np.sqrt(noise.variance(grey[self.white]))
+        return np.asarray(grey[self.white] - grey[self.black] > LIT_SIGMAS * spread)
+
+    def parts(self, grey: np.ndarray, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums less black as parts of white less black, [sums, pixels], and their deviations, [pixels]."""
+        white = np.maximum(grey[self.white] - grey[self.black], 1e-9)
+        sums = self.rows.astype(np.float32) @ grey
+        deviation = np.sqrt(2 * noise.variance(grey[self.white])) / white
+        return (sums - grey[self.black]) / white, deviation
+
+    def moved(self, sample: Sample, noise: NoiseModel) -> np.ndarray:
+        """Return where surfaces have moved, [pixels] bool; nowhere where a reading is or may be clipped, whose sums say nothing."""
+        grey = sample.grey
+        part, deviation = self.parts(grey, noise)
+        away = np.abs(part - self.usual[:, None]).max(axis=0)
+        found = np.asarray(self.lit(grey, noise) & (away > np.maximum(MOVED_SIGMAS * deviation, MOVED_PART)))
+        found &= sample.values.max(axis=(0, 1)) < self.full
+        return found if sample.saturated is None else found & ~sample.saturated.any(axis=0)
+
+
+def moved_pixels(planes: Planes, mask: np.ndarray, sample: Sample, collected: Collected, noise: NoiseModel, *,
+                 shifted: bool) -> tuple[np.ndarray, list[str]]:
+    """Return where surfaces have moved between frames, [rows, cols] bool, and what is said of it; nowhere if it is too little to tell, or
+    if it is everywhere, where most stripes are read rightly all the same. `shifted`: whether it is said already that images have."""
+    sums = EvenSums.of(sample, collected, noise)
+    moved = np.zeros(mask.shape, bool)
+    if sums is None or not sums.moved(sample, noise).any():
+        return moved, []
+    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+        saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
+        part = sample._replace(values=planes.band(band), saturated=saturated)
+        moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
+    share = moved.sum() / mask.sum()
+    if share <= SAID:
+        return np.zeros_like(moved), []
+    clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
+    seen = f"frames[]: the even light of the frames differs at {100 * share:.2g} % of the pixels, as where "
+    if sums.everywhere:
+        return np.zeros_like(moved), [] if shifted else [
+            f"{seen}the whole scene has moved during the sequence, or the camera has recorded parts of two patterns{clipped}: the "
+            "standard deviations do not hold what that makes; keep it still, or wait longer for each pattern"]
+    return moved, [f"{seen}something has moved during the sequence{clipped}: they are unsure"]

@@ -42,7 +42,7 @@ def with_measured_noise(planes: Planes, camera: Camera, mask: np.ndarray, collec
     shape = (-1, min(3, len(mask)), mask.shape[1])
     sample = sample_of(planes, camera, mask, rows)
     grey = sample.grey
-    variance, lit = noise.read**2 + noise.gain * np.maximum(grey, 0), sample.lit(grey, noise)
+    variance, lit = noise.variance(grey), sample.lit(grey, noise)
     across: list[float] = []
     along: list[float] = []
     for apart, expected, alike in _differences(collected, grey, variance):

@@ -47,7 +47,7 @@ def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], 
     if missed:
         names, shows = ", ".join(frames[row].image for row in missed), "shows" if len(missed) == 1 else "show"
         return f"frames: {names} {shows} no stripes, and others do: the projector has missed the pattern; take the sequence again"
-    near = np.maximum(SAME_PART * whole, SAME_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
+    near = np.maximum(SAME_PART * whole, SAME_SIGMAS * np.sqrt(noise.variance(grey.max(axis=0))))
     judged = _judged(collected, level)
     for row in range(1, len(grey)):
         if (judged[row] and stripes[row] and stripes[row - 1] and frames[row].pattern != frames[row - 1].pattern

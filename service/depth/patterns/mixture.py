@@ -32,20 +32,13 @@ BYTES_PER_PIXEL = 400
 
 def widen_mixed(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
                 noise: NoiseModel) -> np.ndarray:
-    """Add to the deviations of places what a second surface in the pixel may make; return the factor by which that widens the depth's,
-    [rows, cols]. `decoders`: of columns and of rows."""
-    wider = np.ones_like(coordinates.amplitude)
-    for decoder, axis in zip(decoders, (coordinates.columns, coordinates.rows), strict=True):
-        part = None if decoder is None or axis is None else _mixed_part(planes, axis, decoder, collected, noise)
-        if part is None or axis is None or decoder is None:
-            continue
-        period = min(next(code for code in decoder.used if isinstance(code, PhaseCode)).periods_px)
-        wider = np.maximum(wider, axis.widen(TURN * part / (1 - part) * period / (2 * np.pi)))
-    return wider
+    """Add to the deviations of places what a second surface in the pixel may make; return the factor of `Coordinates.widen`."""
+    return coordinates.widen(decoders, lambda axis, decoder: _turned(planes, axis, decoder, collected, noise))
 
 
-def _mixed_part(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> np.ndarray | None:
-    """Return the part of the light of each pixel that comes from a second surface, [rows, cols] 0…0.5; None where the code cannot tell."""
+def _turned(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> np.ndarray | None:
+    """Return by how much a second surface may turn the place of each pixel, [rows, cols] projector pixels; None where the code cannot
+    tell."""
     phase = next((code for code in decoder.used if isinstance(code, PhaseCode)), None)
     stripes = next((code for code in decoder.used if isinstance(code, BinaryCode) and code.name != "xor"), None)
     if phase is None or stripes is None or len(set(phase.periods_px)) > 1:
@@ -59,7 +52,8 @@ def _mixed_part(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
         second[band], deviation[band] = (each.reshape(-1, second.shape[1]) for each in _second_bit(grey, stripes, coarse, collected, noise))
     usual = float(np.median(second[axis.solved]))
     clear = axis.solved & (usual - second > CLEAR_SIGMAS * deviation)
-    return np.where(clear, np.clip((usual - second) / (2 * max(usual, 1e-6)), 0, 0.5), 0).astype(np.float32)
+    part = np.where(clear, np.clip((usual - second) / (2 * max(usual, 1e-6)), 0, 0.5), 0).astype(np.float32)  # of the light, from there
+    return np.asarray(TURN * part / (1 - part) * phase.periods_px[0] / (2 * np.pi))
 
 
 def _second_bit(grey: np.ndarray, stripes: BinaryCode, coarse: Sequence[int], collected: Collected,
@@ -70,5 +64,5 @@ def _second_bit(grey: np.ndarray, stripes: BinaryCode, coarse: Sequence[int], co
     away = np.abs(contrasts(grey, stripes, collected)[list(coarse)])
     contrast, times = (away.max(axis=0), 2.0) if stripes.inverses is not None else (grey[collected.white] - grey[collected.black], 6.0)
     contrast = np.maximum(contrast, 1e-9)
-    deviation = np.sqrt(times * (noise.read**2 + noise.gain * np.maximum(bits.max(axis=0), 0))) / contrast
+    deviation = np.sqrt(times * noise.variance(bits.max(axis=0))) / contrast
     return np.partition(away, 1, axis=0)[1] / contrast, deviation

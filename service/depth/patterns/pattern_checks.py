@@ -1,6 +1,6 @@
-"""Checks of a capture under patterns by a sample of its pixels: frames that are declared wrongly, and waves that the projector bends."""
+"""Checks of a capture under patterns by a sample of its pixels: frames that are declared otherwise than they were shown."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,19 +11,15 @@ from kernels.errors import KernelError
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.pattern_frames import NoiseModel
-from kernels.structured.response import bent_wave
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.readings import Readings, grey_of
-from service.depth.patterns.swing import exponent_of_swing
 from stage.capture.camera import Camera
 from stage.errors import StageError
 from stage.patterns.base import Axis, UniformPattern
-from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, Pattern, collect
 from stage.patterns.kary import KaryCode
-from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.stack.planes import Planes
 
 ROWS = 32
@@ -47,12 +43,6 @@ MOST_BRIGHTER = 0.9
 AXES: tuple[Axis, Axis] = ("column", "row")
 NOT_LIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
 """Statuses of pixels that cannot tell whether the frames are declared rightly."""
-MEAN_TOLERANCE = 0.04
-"""Distance of the mean of a wave from half of white above which the projector is not linear; photographs have 0.01."""
-EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
-"""Exponents of light = level^γ that are compared."""
-BAD_FIT, BETTER_FIT = 3.0, 0.5
-"""Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
 FULL_PART = 0.999
 """Part of the largest reading of a sample from which on one may be clipped: corrections of the frames leave clipped ones that even."""
 LIT_SIGMAS = 20.0
@@ -90,7 +80,7 @@ class Sample(NamedTuple):
 
     def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return [pixels] bool: the whole ones that the patterns change by far more than noise, of their readings `grey`."""
-        deviation = np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0))
+        deviation = np.sqrt(noise.variance(grey.max(axis=0)))
         return self.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * deviation)
 
 
@@ -171,7 +161,9 @@ def agreement(sample: Sample, patterns: list[Pattern], projector: PatternProject
     shape = sample.mask.shape
     decoded = [None if decoder is None else decode_sample(sample, decoder, noise, device) for decoder in decoders]
     if mirrored:
-        decoded = [None if axis is None else _mirror(axis, extent, device) for axis, extent in zip(decoded, model.size, strict=True)]
+        decoded = [None if axis is None else axis._replace(
+            coordinate=type(axis.coordinate)(extent - to_numpy(axis.coordinate), device=device))
+            for axis, extent in zip(decoded, model.size, strict=True)]
     found = triangulate(sample.x.ravel(), sample.y.ravel(), decoded[0], decoded[1], model, near_m=0.0, far_m=np.inf, max_residual_px=4.0,
                         device=device)
     depth, sigma, status = (to_numpy(array)[:sample.mask.size].reshape(shape) for array in (found.depth, found.sigma, found.status))
@@ -191,10 +183,6 @@ def agreement(sample: Sample, patterns: list[Pattern], projector: PatternProject
 def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, device: str) -> Decoded:
     """Decode the rows of a sample."""
     return decoder.decode(Readings.of(sample.values, sample.saturated, sample.mask.shape[1], decoder.made, device=device), noise)
-
-
-def _mirror(axis: Decoded, extent: float, device: str) -> Decoded:
-    return axis._replace(coordinate=type(axis.coordinate)(extent - to_numpy(axis.coordinate), device=device))
 
 
 def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], bool], float]) -> Iterator[tuple[float, Reading]]:
@@ -273,87 +261,3 @@ def unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjec
         step = np.where(sure, np.minimum(np.abs(np.diff(u, axis=1)) / extent, LARGEST_STEP), LARGEST_STEP)[pairs]
         steps.append(float(step.mean()) if step.size >= ENOUGH else float("nan"))
     return max(steps, default=float("nan"))
-
-
-def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> float:
-    """Return the exponent γ of light = level^γ that the waves of a capture show; 1.0 where they are as they should be."""
-    for code in collected.codes:
-        if isinstance(code, PhaseCode):
-            found = _exponent_of_mean(sample, code, collected, noise)
-            if found is None:
-                found = _exponent_of_fit(sample, code, collected, projector, noise, device)
-            if found != 1.0:
-                return found
-    return 1.0
-
-
-def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noise: NoiseModel) -> float | None:
-    """Return the exponent from the mean of the waves between black and white; None without frames that tell them."""
-    grey = sample.grey
-    if collected.white is not None and collected.black is not None:
-        dark, span = grey[collected.black], grey[collected.white] - grey[collected.black]
-    else:
-        pair = next((other for other in collected.codes if isinstance(other, BinaryCode) and other.inverses is not None), None)
-        if pair is None or pair.inverses is None:
-            return None
-        span = np.max([np.abs(grey[a] - grey[b]) for a, b in zip(pair.frames, pair.inverses, strict=True)], axis=0)
-        dark = 0.5 * (grey[pair.frames[-1]] + grey[pair.inverses[-1]] - span)
-    good = sample.whole & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
-    if good.sum() < ENOUGH:
-        return None
-    even = [list(wave.frames) for wave in code.waves
-            if len(wave.frames) >= FULL_STEPS and abs(np.exp(2j * np.pi * np.array(wave.shifts)).sum()) < 1e-6]
-    if not even:
-        return None
-    means = [np.median((np.mean(grey[frames], axis=0)[good] - dark[good]) / span[good]) for frames in even]
-    mean = float(np.median(means))
-    if abs(mean - 0.5) <= MEAN_TOLERANCE:
-        return 1.0
-    fine = np.linspace(0.3, 4.0, 371)
-    table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
-    return float(np.interp(-mean, -np.array(table), fine))
-
-
-def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
-                     device: str) -> float:
-    """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
-    grey = sample.grey[list(code.frames)].astype(np.float64)
-    if len(code.frames) < 5:  # offset, amplitude and place leave one reading over at most
-        alone = len(set(code.periods_px)) == 1
-        return exponent_of_swing(grey[:, sample.whole], code.shifts, code.periods_px[0], EXPONENTS, noise) if alone else 1.0
-    variance = noise.read**2 + noise.gain * np.maximum(grey.mean(axis=0), 0)
-    misfit = {}
-    for exponent in EXPONENTS:
-        response = np.linspace(0, 1, 256)**exponent
-        bent = projector._replace(response=None if exponent == 1.0 else tuple(response.tolist()))
-        try:
-            decoder, _ = choose_decoder(collected, code.axis, bent)
-            if decoder is None:
-                return 1.0
-            decoded = decode_sample(sample, decoder, noise, device)
-        except KernelError:  # two places look alike under this response
-            continue
-        u, status = (to_numpy(array)[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
-        keep = (status == OK) & sample.mask.ravel()
-        if keep.sum() < ENOUGH:
-            continue
-        wave = bent_wave(response)
-        turns = (u[keep] / np.array(code.periods_px)[:, None] - np.array(code.shifts)[:, None]) % 1.0
-        light = np.interp(turns, np.arange(len(wave) + 1) / len(wave), np.append(wave, wave[0]))
-        light -= light.mean(axis=0)
-        seen = grey[:, keep] - grey[:, keep].mean(axis=0)
-        rest = (seen**2).sum(axis=0) - (light * seen).sum(axis=0)**2 / np.maximum((light**2).sum(axis=0), 1e-12)
-        misfit[exponent] = float(np.median(rest / variance[keep]) / (len(code.frames) - 3))
-    plain = misfit.get(1.0, float("nan"))
-    if not misfit or not plain > BAD_FIT:
-        return 1.0
-    best = min(misfit, key=lambda exponent: misfit[exponent])
-    return best if misfit[best] < BETTER_FIT * plain else 1.0
-
-
-def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
-    """Return what is said of waves that a projector bends."""
-    done = ("the error that this makes is" if found.left_rad is None else
-            f"they were bent back by it, and the {found.left_rad:.2g} rad that this leaves are")
-    return (f"projector.response: is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear: {done} "
-            f"in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")

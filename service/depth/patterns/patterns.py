@@ -14,30 +14,19 @@ from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.base.epipolar import Contradiction, settled
 from service.depth.base.solution import DepthSolution
 from service.depth.base.triangulation_check import check_projector, missing_calibration
-from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, doubt_coordinates, doubt_pixels
+from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, contradicted, doubt_coordinates, doubt_pixels, widen
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
-from service.depth.patterns.frame_light import full_scale, scene_colour
 from service.depth.patterns.lag import widen_lagging
-from service.depth.patterns.levels import check_levels
+from service.depth.patterns.levels import check_levels, moved_pixels
 from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_noise
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
-from service.depth.patterns.moved import moved_pixels
-from service.depth.patterns.pattern_checks import (
-    Sample,
-    check_declaration,
-    check_references,
-    check_unevenness,
-    find_exponent,
-    response_sentence,
-    sample_of,
-)
-from service.depth.patterns.projector_doubts import contradicted, widen
-from service.depth.patterns.ramp_checks import check_ramps
-from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings
+from service.depth.patterns.pattern_checks import Sample, check_declaration, check_references, check_unevenness, sample_of
+from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings, full_scale, scene_colour
+from service.depth.patterns.response_checks import check_ramps, find_exponent, response_sentence
 from service.depth.patterns.shifted_frames import widen_shifted
 from service.depth.patterns.unseen_stripes import measured_edge_error, unseen_digits, unseen_sentences
 from service.depth.patterns.wave_checks import bent_back, check_waves

@@ -81,17 +81,16 @@ class FrameShifts(NamedTuple):
 
 def widen_shifted(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
                   frames: Sequence[Frame]) -> tuple[list[str], np.ndarray]:
-    """Add to the deviations of places what shifts of the images make; return what is said of it, and the factor by which that widens the
-    depth's, [rows, cols]. `decoders`: of columns and of rows."""
-    wider = np.ones_like(coordinates.amplitude)
-    for decoder, axis in zip(decoders, (coordinates.columns, coordinates.rows), strict=True):
-        if decoder is None or axis is None:
-            continue
+    """Add to the deviations of places what shifts of the images make; return what is said of it, and the factor of `Coordinates.widen`."""
+    def off(axis: AxisMaps, decoder: AxisDecoder) -> np.ndarray | None:
         across = _across(axis)
         found = find_shifts(planes, axis, decoder, collected, frames, across)
-        if found is not None and found.clear:
-            coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
-            wider = np.maximum(wider, axis.widen(found.over(len(frames)) * _slope(axis, across)))
+        if found is None or not found.clear:
+            return None
+        coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
+        return found.over(len(frames)) * _slope(axis, across)
+
+    wider = coordinates.widen(decoders, off)
     if not coordinates.shift_px:
         return [], wider
     return [f"frames[]: the stripes of different frames lie up to {coordinates.shift_px:.2g} camera pixels aside of each other, as where "

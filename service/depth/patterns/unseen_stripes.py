@@ -62,7 +62,7 @@ def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjec
         own = np.array(code.colors) if code.colors is not None else levels
         outer = np.flatnonzero(((own == own.min(axis=0)) | (own == own.max(axis=0))).all(axis=1))
         white, black = light[collected.white], light[collected.black]
-        lit = sample.whole & (white - black > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(white, 0))).all(axis=0)
+        lit = sample.whole & (white - black > LIT_SIGMAS * np.sqrt(noise.variance(white))).all(axis=0)
         apart = np.abs(levels[:, None] - levels).max(axis=2)
         reach = OF_A_STEP[light.shape[1]] * np.where(np.eye(code.base, dtype=bool), np.inf, apart).min(axis=1)
         for number in code.frames[:-1] if lit.any() and len(outer) else ():

@@ -128,7 +128,7 @@ def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise
         readings = grey[list(frames)].astype(np.float64)
         mean, along, across = table.T @ readings
         swing = np.hypot(along, across)
-        spread = np.sqrt(noise.read**2 + noise.gain * np.maximum(mean, 0))
+        spread = np.sqrt(noise.variance(mean))
         clear &= swing > CLEAR_SIGMAS * spread
         phase = np.arctan2(across, along) % (2 * np.pi)
         if projector.wave_response is not None:

@@ -65,7 +65,7 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
     if free < 1 or steps < FULL_STEPS or any(other != named[0] for other in named):
         return None
     readings = grey[roles]
-    variance = noise.read**2 + noise.gain * np.maximum(readings.mean(axis=0), 0)
+    variance = noise.variance(readings.mean(axis=0))
 
     def left(order: np.ndarray) -> float:
         return float(np.median(((left_over @ readings[order.ravel()]) ** 2).sum(axis=0) / variance) / free)

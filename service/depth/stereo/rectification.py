@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import correlate1d
 
+from service.depth.base.triangulation_check import check_baseline
 from stage.capture.camera import Camera, OtherCamera
 from stage.capture.capture import Capture
 from stage.capture.manifest import Frame
@@ -27,8 +28,6 @@ from stage.motion.resample import bicubic, touched
 from stage.stack.planes import scratch_arrays
 from stage.transforms import OPENCV_FROM_CAMERA
 
-LEAST_BASELINE_M, MOST_BASELINE_M = 1e-4, 20.0
-"""The range of plausible distances between two cameras: outside it the translation is not in metres."""
 LEAST_ASIDE = 0.35
 """Sine of the least angle between the baseline and the direction in which both cameras look: an image cannot be rectified whose epipole
 lies in it."""
@@ -120,11 +119,7 @@ def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectificati
     pose = pose_of(other, where=where)
     centre = OPENCV_FROM_CAMERA @ pose[:3, 3]
     baseline = float(np.linalg.norm(centre))
-    if baseline < LEAST_BASELINE_M:
-        raise ManifestError(f"{where}.camera_from_other: the camera stands {baseline:.2g} m from the first: without a baseline there is no "
-                            "depth")
-    if baseline > MOST_BASELINE_M:
-        raise ManifestError(f"{where}.camera_from_other: the camera stands {baseline:.4g} m from the first: give the translation in metres")
+    check_baseline(baseline, f"{where}.camera_from_other: the camera", "the first")
     own = OPENCV_FROM_CAMERA @ pose[:3, :3] @ OPENCV_FROM_CAMERA  # the axes of the other camera in those of the reference
     if own[2, 2] <= 0.2:
         angle = np.degrees(np.arccos(np.clip(own[2, 2], -1, 1)))

@@ -13,7 +13,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from service.depth.base.epipolar import PRIOR, Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
-from service.depth.patterns.frame_light import full_scale
+from service.depth.patterns.readings import full_scale
 from service.depth.stereo.camera_doubts import ENOUGH, as_camera, as_projector, by_chance, contradicted, sentence, widened
 from service.depth.stereo.rectification import Rectification, RectifiedFrames, pose_of, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import (

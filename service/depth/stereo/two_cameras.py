@@ -47,22 +47,18 @@ SMALLEST_SLOPE = 0.02
 
 
 class CodedImage(NamedTuple):
-    """The decoded coordinates of one camera."""
+    """The decoded columns and rows of one camera."""
 
-    column: np.ndarray  # [rows, cols] projector pixels
-    row: np.ndarray  # [rows, cols]
-    sigma_column: np.ndarray  # [rows, cols]
-    sigma_row: np.ndarray  # [rows, cols]
+    values: np.ndarray  # [2, rows, cols] float32, projector pixels
+    sigma: np.ndarray  # [2, rows, cols] float32
     solved: np.ndarray  # [rows, cols] bool
 
 
 class Places(NamedTuple):
     """The places at which the second camera sees the pixels of the first."""
 
-    u: np.ndarray  # [n] continuous image coordinates of the second camera
-    v: np.ndarray  # [n]
-    sigma_u: np.ndarray  # [n] pixels
-    sigma_v: np.ndarray  # [n]
+    place: np.ndarray  # [n, 2] continuous image coordinates of the second camera
+    sigma: np.ndarray  # [n, 2] pixels
     found: np.ndarray  # [n] bool
 
 
@@ -83,26 +79,24 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         if columns is None or rows is None:
             raise RequestError(f"--beside: {each.folder} has a code of one axis alone: two cameras need columns and rows to find the "
                                "place that both see")
-        images.append((found, CodedImage(columns.coordinate, rows.coordinate, columns.sigma, rows.sigma,
+        images.append((found, CodedImage(np.stack([columns.coordinate, rows.coordinate]), np.stack([columns.sigma, rows.sigma]),
                                          np.isin(found.status, SOLVED) & inside)))
     (own, first), (_, second) = images
     timings.stage("match", 1)
     wanted = first.solved
-    places = find_places(first.column[wanted].astype(np.float64), first.row[wanted].astype(np.float64), first.sigma_column[wanted],
-                         first.sigma_row[wanted], second)
-    planes = [np.zeros(mask.shape, np.float32) for _ in range(4)]
-    for plane, values in zip(planes, places[:4], strict=True):
-        plane[wanted] = values
+    asked, asked_sigma = (np.stack([plane[wanted] for plane in two], axis=1) for two in (first.values, first.sigma))
+    places = find_places(asked.astype(np.float64), asked_sigma, second)
+    planes = np.zeros((4, *mask.shape), np.float32)
+    planes[:, wanted] = np.concatenate([places.place, places.sigma], axis=1).T
     status = own.status.copy()
     status[wanted] = np.where(places.found, own.status[wanted], int(Status.OCCLUDED))
 
     def measure(view: Projector, before: Contradiction | None) -> tuple[tuple[DepthSolution, np.ndarray], Contradiction | None]:
         solution, residual = _intersected(own, planes, status, mask, capture.camera, view, request, device)
         judged = solution.solved
-        u, v, sigma_u, sigma_v = (plane[judged] for plane in planes)
-        return (solution, residual), contradiction(
-            view, capture.camera.points(-solution.depth)[judged], np.stack([u, v], axis=1), np.stack([sigma_u, sigma_v], axis=1),
-            least_px=LEAST_PX, alike=float(2 * REACH + 1) ** 2, free=TURNED, before=before)
+        seen, sigma = (np.stack([plane[judged] for plane in two], axis=1) for two in (planes[:2], planes[2:]))
+        return (solution, residual), contradiction(view, capture.camera.points(-solution.depth)[judged], seen, sigma, least_px=LEAST_PX,
+                                                   alike=float(2 * REACH + 1) ** 2, free=TURNED, before=before)
 
     view, (solution, residual), contradicted = settled(given, measure, refine=request.refine_projector)
     told = {"capture": str(beside), "matched": int(places.found.sum()), "residual_px": statistics(residual[solution.solved])}
@@ -123,13 +117,13 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
     return solution
 
 
-def _intersected(own: DecodedSolution, planes: list[np.ndarray], status: np.ndarray, mask: np.ndarray, camera: Camera, seen_by: Projector,
+def _intersected(own: DecodedSolution, planes: np.ndarray, status: np.ndarray, mask: np.ndarray, camera: Camera, seen_by: Projector,
                  request: DepthRequest, device: str) -> tuple[DepthSolution, np.ndarray]:
     """Return where the lines of sight of both cameras meet, and by how many pixels of the second they miss each other, [rows, cols].
 
     Args:
         own: what the first camera has decoded.
-        planes: columns and rows of the places in the second camera, and their standard deviations, each [rows, cols] pixels.
+        planes: columns and rows of the places in the second camera, and their standard deviations, [4, rows, cols] pixels.
         status: [rows, cols] of the places.
         seen_by: the second camera.
     """
@@ -193,29 +187,24 @@ def _decoded(coordinate: np.ndarray, sigma: np.ndarray, amplitude: np.ndarray, s
 # Each pixel of the second camera has decoded a column and a row; in the neighbourhood of a pixel they are nearly linear in the image. A
 # plane is fitted to each there, and the place at which both have the wanted values is where that pixel and the slopes of the planes say.
 
-def find_places(column: np.ndarray, row: np.ndarray, sigma_column: np.ndarray, sigma_row: np.ndarray, other: CodedImage) -> Places:
+def find_places(asked: np.ndarray, asked_sigma: np.ndarray, other: CodedImage) -> Places:
     """Find the places of the projector in the image of a second camera.
-    `column, row`: [n] of the first camera, projector pixels, with their standard deviations. `other`: what the second camera has
-    decoded."""
-    count = len(column)
-    nothing = Places(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
+    `asked, asked_sigma`: [n, 2] columns and rows of the first camera, projector pixels, and their standard deviations. `other`: what the
+    second camera has decoded."""
     planes = _planes(other)
     if planes is None:
-        return nothing
+        return Places(np.zeros(asked.shape), np.zeros(asked.shape), np.zeros(len(asked), dtype=bool))
     place, value, slope, variance = planes
     spacing = float(np.sqrt(np.median(np.abs(np.linalg.det(slope)))))
-    asked = np.stack([column, row], axis=1)
     far, nearest = cKDTree(value).query(asked, distance_upper_bound=FARTHEST_CELLS * max(spacing, 1e-6))
     nearest = np.minimum(nearest, len(value) - 1)  # of none that is near enough
     inverse = np.linalg.inv(slope[nearest])
     wanted = asked - value[nearest]
     moved = np.einsum("nij,nj->ni", inverse, wanted)
-    spread = variance[nearest] + np.stack([sigma_column, sigma_row], axis=1) ** 2
+    spread = variance[nearest] + asked_sigma**2
     sigma = np.sqrt(np.einsum("nij,nj->ni", inverse**2, spread))
     found = np.isfinite(far) & (np.abs(moved).max(axis=1) <= FARTHEST_PX)
-    at = place[nearest] + moved
-    u, v, sigma_u, sigma_v = (np.where(found, values, 0) for values in (at[:, 0], at[:, 1], sigma[:, 0], sigma[:, 1]))
-    return Places(u, v, sigma_u, sigma_v, found)
+    return Places(np.where(found[:, None], place[nearest] + moved, 0), np.where(found[:, None], sigma, 0), found)
 
 
 def _planes(other: CodedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
@@ -224,11 +213,12 @@ def _planes(other: CodedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     rows, cols = solved.shape
     if min(rows, cols) <= 2 * REACH or not solved.any():
         return None
-    values = np.stack([other.column, other.row]).astype(np.float64)
-    across, down = ((np.abs(np.diff(values, axis=axis)), np.logical_and(*_pairs(solved, axis - 1))) for axis in (2, 1))
+    values = other.values.astype(np.float64)
+    across = np.abs(np.diff(values, axis=2)), solved[:, 1:] & solved[:, :-1]
+    down = np.abs(np.diff(values, axis=1)), solved[1:] & solved[:-1]
     usual = np.array([max((float(np.median(step[number][both])) for step, both in (across, down) if both.any()), default=0.0)
                       for number in range(2)])
-    usual = np.maximum(usual, 1e-3) + np.array([np.median(sigma[solved]) for sigma in (other.sigma_column, other.sigma_row)])
+    usual = np.maximum(usual, 1e-3) + np.array([np.median(sigma[solved]) for sigma in other.sigma])
     inner = (slice(REACH, rows - REACH), slice(REACH, cols - REACH))
     middle = values[:, inner[0], inner[1]]
     gram = np.zeros((*middle.shape[1:], 3, 3))
@@ -251,7 +241,7 @@ def _planes(other: CodedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     inverse = np.linalg.inv(gram[good])
     fitted = np.einsum("nij,knj->kni", inverse, right[:, good])
     left = np.maximum(squares[:, good] - (fitted * right[:, good]).sum(axis=2), 0) / np.maximum(number[good] - 3, 1)
-    sigmas = np.stack([sigma[inner][good] for sigma in (other.sigma_column, other.sigma_row)]).astype(np.float64)
+    sigmas = np.stack([sigma[inner][good] for sigma in other.sigma]).astype(np.float64)
     # the decoder's error or that of the plane, whichever is larger, over the pixels of the window
     variance = np.maximum(sigmas**2, left) * inverse[:, 0, 0]
     slope = np.moveaxis(fitted[:, :, 1:], 0, 1)
@@ -263,8 +253,3 @@ def _planes(other: CodedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     place = np.stack([x + REACH + 0.5, y + REACH + 0.5], axis=1)
     value = (middle[:, good] + fitted[:, :, 0]).T
     return place[kept], value[kept], slope[kept], variance.T[kept]
-
-
-def _pairs(solved: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether a pixel and the next along an axis are solved."""
-    return (solved[:-1], solved[1:]) if axis == 0 else (solved[:, :-1], solved[:, 1:])

@@ -16,8 +16,7 @@ from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
 from service.depth.base.solution import RangeImage
 from service.depth.tof.count_scale import CountScale, estimate_count_scale
-from service.depth.tof.fog import find_fog
-from service.depth.tof.shared_bins import pattern_bins, without_bins
+from service.depth.tof.shared_light import find_fog, pattern_bins, without_bins
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
 from stage.tof.calibration import TofCalibration
@@ -122,7 +121,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
                         f"{start_m + bin_m * (len(pattern) - np.argmax(pattern[::-1]) - 0.5):.3g} m, which is taken for the camera's own "
                         "light, or for bins that its timer fills: returns are looked for outside of them; give --near-m beyond it, or "
                         "before it to keep it")
-    histograms, shape, pile_up = _live(frames, photons_of, calibration, pattern, usable, device, warnings)
+    histograms, shape, pile_up = live_photons(frames, photons_of, calibration, pattern, usable, device, warnings)
     pulse, source, zero_bins = _zero_of(shape, frames, calibration, warnings)
     found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=first_bin, last_bin=last_bin)
     chosen = _choose(found, options.which, None if fog is None else np.stack([
@@ -204,17 +203,11 @@ def scale_warnings(scale: CountScale) -> list[str]:
     return warnings
 
 
-def pile_up_warning(found: PulseCount) -> str:
-    """Return what is said of pile-up that was found."""
-    return ("tof.pulses, tof.first_photon_only: the histograms show pile-up that is not declared, as if the first photon alone of each of "
-            f"{found.pulses} pulses had been counted ({100 * found.used:.0f} % of the pulses in the fullest histogram), and were corrected "
-            "for it: declare both")
-
-
-def _live(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, pattern: np.ndarray, usable: np.ndarray, device: str,
-          warnings: list[str]) -> tuple[LiveCounts, PulseShape, PulseCount | None]:
+def live_photons(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, pattern: np.ndarray, usable: np.ndarray,
+                 device: str, warnings: list[str]) -> tuple[LiveCounts, PulseShape, PulseCount | None]:
     """Return the histograms without pile-up, declared or found, their pulse, and the number of pulses if it was found; adds a sentence to
-    `warnings`."""
+    `warnings`.
+    `photons`: [pixel, bin]. `pattern`: [bin] bool, those that show no return. `usable`: [pixel] bool, those that decide."""
     counts = place(photons, device)
     shown = np.where(usable[:, None] & ~pattern, photons, 0)
 
@@ -241,7 +234,9 @@ def _live(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, 
     found = estimate_pulses(photons[usable], shape.pulse, device, lambda some, seen: shape_of(some, seen).pulse, declared=known)
     if found is None:
         return histograms, shape, None
-    warnings.append(pile_up_warning(found))
+    warnings.append("tof.pulses, tof.first_photon_only: the histograms show pile-up that is not declared, as if the first photon alone of "
+                    f"each of {found.pulses} pulses had been counted ({100 * found.used:.0f} % of the pulses in the fullest histogram), "
+                    "and were corrected for it: declare both")
     histograms = correct_pileup(counts, pulses=found.pulses)
     return histograms, shape_of(histograms, shown), found
 

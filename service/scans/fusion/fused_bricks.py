@@ -19,10 +19,9 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
-from service.scans.fusion.common_scale import LEAST_SCANS, common_scale
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, place_scans, reach_of, readings_of
-from service.scans.fusion.other_readings import meant_otherwise
+from service.scans.fusion.other_readings import LEAST_SCANS, common_scale, meant_otherwise
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma

@@ -1,6 +1,8 @@
-"""Whether scans lie on each other far better if their poses are read otherwise, as files of other programs have them.
+"""Whether scans lie on each other far better if their poses are read otherwise, as files of other programs have them, or at another scale.
 
-About an axis of a round body inverted poses lay scans on each other over most of the surface; what differs, as an arm, is there twice."""
+About an axis of a round body inverted poses lay scans on each other over most of the surface; what differs, as an arm, is there twice.
+Where poses are right and their unit or calibration is not, each surface grows about its own scanner, and every scan seems misplaced.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.scans.fusion.misplaced import LEAST_COMMON, SAME_SIGMAS, Readings, Sample
+from service.scans.fusion.misplaced import LEAST_COMMON, ROUNDS, SAME_SIGMAS, Readings, Sample
 from service.scans.fusion.range_images import PreparedScan
 from stage.transforms import OPENCV_FROM_CAMERA
 
@@ -18,6 +20,8 @@ coarse; of inverted ones about a body that is not nearly the same all around its
 FAR_BETTER = 0.5
 """Part of the contradicting points that may be left with poses that are read otherwise: where these are the right ones .01 to .44 are, and
 where the poses as given are, 2.3 times as many or more contradict."""
+LEAST_SCANS = 3
+"""Fewest scans whose scale can be told from their places: two that lie apart along their lines of sight fit at some scale too."""
 OPENCV = np.eye(4)
 OPENCV[:3, :3] = OPENCV_FROM_CAMERA
 """To the axes of OpenCV, in which the poses of imported frames are, and back."""
@@ -93,3 +97,21 @@ def meant_otherwise(samples: list[Sample], readings: list[Readings], poses: list
             return (f"{words}: read so, {found.agreeing} points of scans lie on other scans and {found.common - found.agreeing} beside "
                     f"them, and {given.agreeing} and {given.common - given.agreeing} as they are: write them as scan_to_world")
     return None
+
+
+def common_scale(samples: list[Sample], readings: list[Readings], scanners: np.ndarray) -> tuple[float, list[Readings]]:
+    """Return the factor by which the depths of all scans must be multiplied to lie on each other best, and what the readings are then.
+
+    `readings`: of each scan, as `misplaced.readings_of` returns them. `scanners`: [N, 3] metres, world, where each scan was taken from."""
+    firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
+    normals = np.concatenate([sample.normals for sample in samples])
+    towards = [np.einsum("ni,ni->n", normals[each.at], scanners[number] - scanners[np.searchsorted(firsts, each.at, side="right") - 1])
+               for number, each in enumerate(readings)]  # how fast a point leaves the surface as the scale grows
+    along, distance = np.concatenate(towards), np.concatenate([each.distance for each in readings]).astype(np.float64)
+    growth = 0.0
+    for _ in range(ROUNDS):
+        rest = np.abs(distance + growth * along)
+        weight = along / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)
+        growth = -float(weight @ distance) / max(float(weight @ along), 1e-12)
+    return 1 + growth, [each._replace(distance=(each.distance + growth * part).astype(np.float32))
+                        for each, part in zip(readings, towards, strict=True)]

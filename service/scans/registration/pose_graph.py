@@ -80,7 +80,8 @@ def solve(edges: Sequence[Edge], start: dict[int, np.ndarray], *, fixed: int, fr
 
     def improve(weights: np.ndarray) -> None:
         system, gradient = _system(edges, poses, order, weights / scale**2, centre)
-        pull = basis.T @ gradient + held @ held_by @ _against(start, poses, order, centre)
+        moved = np.concatenate([step_between(poses[number] @ inverse(start[number]), centre) for number in order])
+        pull = basis.T @ gradient + held @ held_by @ moved
         step = -basis @ _least_squares(basis.T @ system @ basis + held, pull)
         for k, number in enumerate(order):
             poses[number] = screwed(step[6 * k:6 * k + 6], centre, poses[number])
@@ -145,10 +146,6 @@ def _held(order: list[int], basis: np.ndarray, priors: dict[int, np.ndarray], fr
             if columns.size:
                 out[np.ix_(columns, columns)] = priors[number]
     return out
-
-
-def _against(first: dict[int, np.ndarray], poses: dict[int, np.ndarray], order: list[int], centre: np.ndarray) -> np.ndarray:
-    return np.concatenate([step_between(poses[number] @ inverse(first[number]), centre) for number in order])
 
 
 def _misfits(edges: Sequence[Edge], poses: dict[int, np.ndarray]) -> np.ndarray:

@@ -1,11 +1,9 @@
 """Registration of many scans: which pairs belong together, the poses that fit all of them, and which scans cannot be joined.
 
-Scans are needed one or two at a time. Who calls says where they are in the meantime, and where pairs are registered: by threads that share
-the memory, or by several workers that share a disk.
+Scans are needed one or two at a time. Who calls says where they are in the meantime, and where pairs are registered.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -15,16 +13,15 @@ import numpy as np
 
 from service.scans.points.rigid import inverse
 from service.scans.points.scan import Scan, Target
-from service.scans.registration.candidates import ALL_PAIRS, PARTNERS, Outline, Overlaps, likeness, most_alike, outline_of, overlapping
+from service.scans.registration.candidates import ALL_PAIRS, PARTNERS, Outline, Overlaps, likeness, most_alike, overlapping
 from service.scans.registration.covariance import covariances, rows_of
-from service.scans.registration.diagnosis import odd_scales, why_alone
-from service.scans.registration.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
+from service.scans.registration.diagnosis import odd_scales, refusal, refused_targets, why_alone
+from service.scans.registration.extent import CELLS_ACROSS, cells_of, usual_extent
 from service.scans.registration.fine import Rows
 from service.scans.registration.look_alikes import looks_alike_turned
-from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
-from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
+from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask
+from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
-from service.scans.registration.refusals import refusal, refused_targets
 from service.scans.registration.seen_through import open_pairs, wrongly_joined
 from service.scans.registration.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from stage.errors import ScanError
@@ -49,8 +46,6 @@ class RegistrationOptions:
     """Whether a pose is taken although turned ones pass all tests as well."""
     starts_decide: bool = False
     """Whether starts are taken in directions that the surfaces leave open, and although parts of the surfaces are seen through."""
-    threads: int = 1
-    """Pairs that `register` makes at one time."""
 
 
 class ScanWork(Protocol):
@@ -105,21 +100,13 @@ class NoneJoinedError(ScanError):
         self.alone, self.pairs = alone, pairs
 
 
-def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
-             table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
-    """Find the poses of scans of one object, all of which are in memory.
-    `starts`: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
-    `table`: the turntable, if its axis is right and only the angles are to be found. `advance`: told how far the work is, from 0 to 1."""
-    with ThreadPoolExecutor(options.threads) as pool:
-        return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
-                           table=table, targets={number: scan.targets for number, scan in enumerate(scans)}, advance=advance)
-
-
 def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], starts: Sequence[np.ndarray | None],
                 options: RegistrationOptions, *, table: Turntable | None = None, targets: Mapping[int, Sequence[Target]] | None = None,
                 advance: Advance = lambda done: None) -> Registration:
-    """Find the poses of scans of one object, whose names are for messages; other arguments as of `register`.
-    `extents`: of the scans, as `extent_of` returns it. `targets`: the targets that each scan shows. None: there are none."""
+    """Find the poses of scans of one object, whose names are for messages.
+    `extents`: of the scans, as `extent_of` returns it. `starts`: world_from_scan [4, 4] of each that is right to about a cell of the rough
+    scale and some degrees; None: nothing is known. `table`: the turntable, if its axis is right and only the angles are to be found.
+    `targets`: the targets that each scan shows. None: there are none. `advance`: told how far the work is, from 0 to 1."""
     count = len(names)
     cells = dict(cells_of(extents, starts, options.cell_m))
     usual = usual_extent(extents)
@@ -193,38 +180,6 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
     return Registration(joined, spread, _reference(joined, starts, options), (*pairs.values(), *targeted.values()), alone,
                         odd_scales(kept, list(joined)), tuple(zip(kept, map(float, solved.weights), strict=True)), solved.factor, common,
                         tuple(target_places(shown, joined, spread)), turned)
-
-
-class _InMemory:
-    """Scans in memory, and threads that register pairs of them."""
-
-    def __init__(self, scans: Sequence[Scan], pool: ThreadPoolExecutor) -> None:
-        self._scans, self._pool = scans, pool
-        self._ready: dict[int, Prepared] = {}
-
-    def outlines(self, cells: dict[int, float], advance: Advance) -> dict[int, Outline]:
-        made = self._pool.map(lambda number: prepare(self._scans[number], cell_m=cells[number]), cells)
-        for done, (number, ready) in enumerate(zip(cells, made, strict=True)):
-            self._ready[number] = ready
-            advance((done + 1) / len(cells))
-        return {number: outline_of(ready, cells[number]) for number, ready in self._ready.items()}
-
-    def ready(self, number: int) -> Prepared:
-        return self._ready[number]
-
-    def pairs(self, tasks: Sequence[PairTask], cells: dict[int, float], least_overlap: float, advance: Advance) -> list[Pair]:
-        found = []
-        for pair in self._pool.map(lambda task: register_pair(task, self._ready[task.a], self._ready[task.b],
-                                                              cell_m=(cells[task.a], cells[task.b]), least_overlap=least_overlap), tasks):
-            found.append(pair)
-            advance(len(found) / len(tasks))
-        return found
-
-    def rows(self, pair: Pair) -> Rows:
-        return rows_of(pair)
-
-    def scan(self, number: int) -> Scan:
-        return self._scans[number]
 
 
 Registered = Callable[[Sequence[PairTask], float, float], dict[tuple[int, int], Pair]]

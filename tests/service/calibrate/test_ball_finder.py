@@ -9,7 +9,7 @@ from service.calibrate.lights import grey_ball, light_positions, mirror_ball
 from service.errors import RequestError
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from tests.reference.balls import lambertian, render
-from tests.scenes.captures import angles_degrees, files_in, write_exr, write_manifest
+from tests.scenes.captures import angles_degrees, files_in, write_lit
 from tests.service.calibrate.solvers.balls import spread
 
 WIDTH, HEIGHT = 320, 240
@@ -47,7 +47,7 @@ def room(number, seed=0):
 def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005):
     """The capture of a ball in the room, a book before its lower right side where `hidden`."""
     lens, place = CAMERAS[camera]
-    random = np.random.default_rng(3)
+    random, images = np.random.default_rng(3), []
     for number, direction in enumerate(DIRECTIONS):
         image, coverage = render(shade_of(direction), width=WIDTH, height=HEIGHT, samples=3, **place)
         behind = room(number)
@@ -55,11 +55,8 @@ def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005
         if hidden:
             rows, cols = np.mgrid[:HEIGHT, :WIDTH]
             values = np.where((cols > 130) & (rows > 145), 0.15 + 0.02 * (cols % 7), values)
-        values = np.maximum(values + noise * random.normal(size=values.shape), 0)
-        write_exr(folder / f"{number:03d}.exr", np.repeat(values[..., None], 3, axis=2))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "ball", "camera": {"resolution": [WIDTH, HEIGHT], **lens},
-                            "frames": [{"image": f"{i:03d}.exr", "light": PLACEHOLDER} for i in range(len(DIRECTIONS))]})
-    return folder
+        images.append(np.maximum(values + noise * random.normal(size=values.shape), 0))
+    return write_lit(folder, images, [PLACEHOLDER] * len(images), camera={"resolution": [WIDTH, HEIGHT], **lens})
 
 
 def measured(folder):
@@ -128,18 +125,15 @@ def near_lamp(lamp, brightness=4.0):
 
 
 def two_balls(folder, radii=(BALL_M, BALL_M)):
-    random = np.random.default_rng(4)
+    random, images = np.random.default_rng(4), []
     for number, lamp in enumerate(LAMPS):
         values = room(number)
         for centre, radius in zip(BALLS, radii, strict=True):
             image, coverage = render(near_lamp(lamp), width=WIDTH, height=HEIGHT, samples=3, centre=centre, radius=radius, pixel_size=0.001)
             values = image + (1 - coverage) * values
-        values = np.maximum(values + 0.005 * random.normal(size=values.shape), 0)
-        write_exr(folder / f"{number:03d}.exr", np.repeat(values[..., None], 3, axis=2))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "balls",
-                            "camera": {"resolution": [WIDTH, HEIGHT], "projection": "orthographic", "pixel_size_m": 0.001},
-                            "frames": [{"image": f"{i:03d}.exr", "light": PLACEHOLDER} for i in range(len(LAMPS))]})
-    return folder
+        images.append(np.maximum(values + 0.005 * random.normal(size=values.shape), 0))
+    camera = {"resolution": [WIDTH, HEIGHT], "projection": "orthographic", "pixel_size_m": 0.001}
+    return write_lit(folder, images, [PLACEHOLDER] * len(images), camera=camera)
 
 
 @pytest.mark.long
@@ -168,7 +162,6 @@ def test_one_ball_does_not_place_lights(tmp_path):
 @pytest.mark.parametrize(("camera", "kind", "circle"), [
     ("orthographic", "mirror", "115.7,100.2,59"), pytest.param("perspective", "grey", "78.8,84.8,60.7", marks=pytest.mark.long)])
 def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp_path, camera, kind, circle):
-    """Without it the directions of the mirror were 7° off, where 1° was stated."""
     shade = chrome if kind == "mirror" else lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0)
     folder = photograph(tmp_path / "capture", camera, shade)
     outcome = relit.done("calibrate", f"{kind}-ball", folder, "--ball", circle, *(["--refine-direction"] if kind == "grey" else []))

@@ -44,8 +44,7 @@ def cw(view):
 def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
     steps = [(f"d{k}", depth, 0.04, 25.0) for k, depth in enumerate(np.linspace(0.8, 7.5, 40))]
     steps += [(f"w{k}", 2.0 + k, 0.04 + 1e-3 * (warm - 25), warm) for k, warm in enumerate((15.0, 35.0, 45.0))]
-    outcome = relit("calibrate", "tof", sweep(tmp_path, steps, cw), "--out", tmp_path / "camera.json", "--device", "cpu")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("calibrate", "tof", sweep(tmp_path, steps, cw), "--out", tmp_path / "camera.json", "--device", "cpu")
     assert "wiggling at 80 MHz" in outcome.out and "before" in outcome.out
     calibration = read_calibration(tmp_path / "camera.json")
     assert calibration.temperature is not None
@@ -112,10 +111,8 @@ def test_distances_in_another_unit_or_scale_are_told(tmp_path, relit):
     assert 0.5 < abs(np.median(maps.depth[maps.mask]) - 3.3) / report["found"]["calibration_sigma_m"] < 1.5
     assert any("--tof-calibration" in words for words in report["warnings"])
     before = (tmp_path / "camera.json").read_bytes()
-    outcome = scaled(100)
-    assert outcome.code == 2 and "check depth_m, its unit" in outcome.err
-    outcome = scaled(1.05)
-    assert outcome.code == 2 and "times too long" in outcome.err
+    scaled(100).refused("check depth_m, its unit")
+    scaled(1.05).refused("times too long")
     assert (tmp_path / "camera.json").read_bytes() == before
 
 

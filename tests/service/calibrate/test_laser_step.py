@@ -78,9 +78,7 @@ def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
     before = (folder / "capture.json").read_bytes()
 
     def refused(*words, step=("--step-m", HEIGHT)):
-        outcome = relit("calibrate", "laser-planes", *words, *step, "--device", "cpu")
-        assert outcome.code == 2 and outcome.err.count("\n") == 1, outcome.err
-        return outcome.err
+        return relit.refused("calibrate", "laser-planes", *words, *step, "--device", "cpu")
 
     assert "50: is 50 m, more than a step has: give metres, such as 0.05" in refused(folder, step=("--step-m", 50))
     assert "give --board and --square-m for a chessboard, or --step-m" in refused(folder, step=())

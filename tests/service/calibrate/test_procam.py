@@ -14,8 +14,8 @@ from stage.formats import exr
 from stage.formats.images import read_pixels
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
-from tests.scenes.captures import edit_manifest, write_image, write_manifest
-from tests.scenes.depth import BLACK_WHITE, entry_of
+from tests.scenes.captures import edit_manifest, write_image, write_images, write_manifest
+from tests.scenes.depth import BLACK_WHITE, entries_of, entry_of, phase_patterns, shown
 from tests.service.calibrate.solvers import test_charuco as charuco
 from tests.service.calibrate.solvers import test_procam as boards
 
@@ -28,13 +28,12 @@ REAL = Path(os.environ.get("RELIT_TEST_DATA", "nowhere")) / "graycode_chessboard
 OTHER = reference.Device(420, 300, 520.0, (-0.08, 0.02, 0.0), (-0.0005, 0.001))
 POSE = reference.look_at((0.14, 0.01, 0.005), (0.0, 0.0, -0.9))
 UNKNOWN = {"name": "right", "resolution": [OTHER.width, OTHER.height]}
+BOARD = "--board", "9x6", "--square-m", 0.03
+WORDS = *BOARD, "--projector", "256x192"
+PLAIN_CAMERA = {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}
 
 
-def phase(axis, period):
-    return [{"code": "phase", "axis": axis, "period_px": period, "step": step, "steps": 3} for step in range(3)]
-
-
-PATTERNS = [*phase("column", 24), *phase("column", 25), *phase("row", 24), *phase("row", 25), *BLACK_WHITE]
+PATTERNS = [*(wave for axis in ("column", "row") for period in (24, 25) for wave in phase_patterns(axis, period, 3)), *BLACK_WHITE]
 
 
 def write_view(folder, pose, radiance=None, **manifest):
@@ -45,18 +44,9 @@ def write_view(folder, pose, radiance=None, **manifest):
     points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
     uv = reference.seen_by(PROJECTOR, boards.POSE, points)
     reached = ((uv >= 0) & (uv < (PROJECTOR.width, PROJECTOR.height))).all(axis=-1)
-    frames = []
-    for number, pattern in enumerate(PATTERNS):
-        if pattern["code"] == "phase":
-            u = uv[..., 0 if pattern["axis"] == "column" else 1]
-            light = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
-        else:
-            light = np.full(radiance.shape, float(pattern["code"] == "white"))
-        light = np.where(reached, light, 0)
-        write_image(folder / f"{number}.png", np.rint(65535 * radiance * (0.02 + 0.9 * light)).astype(np.uint16))
-        frames.append({"image": f"{number}.png", "pattern": pattern})
-    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames, **manifest,
-                            "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
+    images = [radiance * (0.02 + 0.9 * np.where(reached, shown(pattern, uv), 0)) for pattern in PATTERNS]
+    frames = write_images(folder, images, entries_of(PATTERNS), "{}.png")
+    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames, **manifest, "camera": PLAIN_CAMERA})
     return points
 
 
@@ -68,13 +58,29 @@ def rig(tmp_path_factory):
     return [folder / f"pose{number}" for number in range(5)], points[0]
 
 
+@pytest.fixture
+def copies(rig, tmp_path):
+    """The captures of the rig once more, to be changed."""
+    return [shutil.copytree(folder, tmp_path / folder.name) for folder in rig[0]]
+
+
+def calibrated(relit, folders, *words):
+    """The manifest of the first capture after a calibration, and what is reported."""
+    relit.done("calibrate", "procam", *folders, *words)
+    return Capture.open(folders[0]).manifest, json.loads((folders[0] / "calibration.json").read_text())["procam"]
+
+
+def focal_off(device, truth):
+    """The largest part by which a focal length is off."""
+    return np.abs(np.array(device.focal_px) / truth.focal - 1).max()
+
+
 def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     folders, points = rig
-    outcome = relit.done("calibrate", "procam", *folders, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")
+    outcome = relit.done("calibrate", "procam", *folders, *WORDS)
     assert "pose4" in outcome.out and "px RMS" in outcome.out
     manifest = Capture.open(folders[2]).manifest
-    assert np.abs(np.array(manifest.camera.focal_px) / CAMERA.focal - 1).max() < 0.01
-    assert np.abs(np.array(manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    assert focal_off(manifest.camera, CAMERA) < 0.01 and focal_off(manifest.projector, PROJECTOR) < 0.01
     place = np.array(manifest.projector.camera_from_projector)[:3, 3]
     assert np.linalg.norm(place - boards.POSE[:3, 3]) < 0.005
     report = json.loads((folders[0] / "calibration.json").read_text())["procam"]
@@ -88,16 +94,12 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     assert np.median(off) < 0.01  # of 0.9 m: five views of corners that are good to 0.1 px
 
 
-def test_copies_of_a_pose_count_once(relit, rig, tmp_path):
+def test_copies_of_a_pose_count_once(relit, copies, tmp_path):
     """Noise that is counted again and again is not averaged: σ was 1.8 times too small with four copies of each pose."""
-    folders = [shutil.copytree(folder, tmp_path / folder.name) for folder in rig[0]]
-    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192"
-    reports = []
-    for more in ([], [shutil.copytree(folder, tmp_path / f"again {folder.name}") for folder in folders[:3]]):
-        relit.done("calibrate", "procam", *folders, *more, *words)
-        reports.append(json.loads((folders[0] / "calibration.json").read_text())["procam"])
+    again = [shutil.copytree(folder, tmp_path / f"again {folder.name}") for folder in copies[:3]]
+    reports = [calibrated(relit, [*copies, *more], *WORDS)[1] for more in ([], again)]
     assert reports[0]["sigma"] == reports[1]["sigma"]
-    assert [left["remark"] for left in reports[1]["left_out"]] == [f"left out: a copy of {folder}" for folder in folders[:3]]
+    assert [left["remark"] for left in reports[1]["left_out"]] == [f"left out: a copy of {folder}" for folder in copies[:3]]
 
 
 def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
@@ -109,15 +111,12 @@ def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
         radiance[:, :130] = 0.1 if number % 2 else radiance[:, :130]
         write_view(tmp_path / f"pose{number}", pose, radiance)
         folders.append(tmp_path / f"pose{number}")
-    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192", "--markers", "aruco4", "--marker-m"
+    words = *WORDS, "--markers", "aruco4", "--marker-m"
     assert "of a square wide" in relit.refused("calibrate", "procam", *folders, *words, 0.015)
-    relit.done("calibrate", "procam", *folders, *words, 0.0225)
-    manifest = Capture.open(folders[0]).manifest
-    views = json.loads((folders[0] / "calibration.json").read_text())["procam"]["views"]
-    assert len(views) == 6 and min(view["corners"] for view in views) < 54
+    manifest, report = calibrated(relit, folders, *words, 0.0225)
+    assert len(report["views"]) == 6 and min(view["corners"] for view in report["views"]) < 54
     # squares of 17 pixels with markers 2 pixels from each corner: corners are good to 0.25 px, and two thirds of a chessboard's are seen
-    assert np.abs(np.array(manifest.camera.focal_px) / CAMERA.focal - 1).max() < 0.025
-    assert np.abs(np.array(manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.025
+    assert focal_off(manifest.camera, CAMERA) < 0.025 and focal_off(manifest.projector, PROJECTOR) < 0.025
     assert np.linalg.norm(np.array(manifest.projector.camera_from_projector)[:3, 3] - boards.POSE[:3, 3]) < 0.005
 
 
@@ -125,9 +124,7 @@ def test_what_is_wrong_is_said(relit, rig, tmp_path):
     folders, _ = rig
 
     def refused(*arguments):
-        outcome = relit("calibrate", "procam", *arguments)
-        assert outcome.code == 2 and len(outcome.err.splitlines()) == 1
-        return outcome.err
+        return relit.refused("calibrate", "procam", *arguments)
 
     given = "--square-m", 0.03, "--board"
     assert "2 of the views can be used" in refused(*folders[:2], *given, "9x6", "--projector", "256x192")
@@ -144,33 +141,24 @@ def test_what_is_wrong_is_said(relit, rig, tmp_path):
     assert "no row code" in refused(tmp_path / "one", *given, "9x6", "--projector", "256x192")
 
 
-def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, rig, tmp_path):
+def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, copies, tmp_path):
     """As relit import opencv-gray writes it; with a response of its light, which stays."""
-    folders, _ = rig
-    copies = [shutil.copytree(folder, tmp_path / folder.name) for folder in folders]
     for folder in copies:
-        edit_manifest(folder, projector={"resolution": [256, 192], "response": [0, 0.5, 1]}, camera={
-            "projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]})
+        edit_manifest(folder, projector={"resolution": [256, 192], "response": [0, 0.5, 1]}, camera=PLAIN_CAMERA)
     assert "projector    256x192, not calibrated: see relit calibrate" in relit("info", copies[0]).out
     outcome = relit("depth", copies[0], "--out", tmp_path / "out")
     assert outcome.code == 0 and "without depth" in outcome.out  # tests/service/depth/patterns/test_decoded_only.py
-    relit.done("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03)
-    projector = Capture.open(copies[0]).manifest.projector
-    assert projector.resolution == (256, 192) and projector.response == (0, 0.5, 1)
-    assert np.abs(np.array(projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    projector = calibrated(relit, copies, *BOARD)[0].projector
+    assert projector.resolution == (256, 192) and projector.response == (0, 0.5, 1) and focal_off(projector, PROJECTOR) < 0.01
 
 
-def test_poses_with_phases_alone_calibrate(relit, rig, tmp_path):
+def test_poses_with_phases_alone_calibrate(relit, copies):
     """The mean of a wave over its shifts is the image under even light, in which the corners are found: no white frame is needed."""
-    folders, _ = rig
-    copies = [shutil.copytree(folder, tmp_path / folder.name) for folder in folders]
     for folder in copies:
         frames = json.loads((folder / "capture.json").read_text())["frames"]
         edit_manifest(folder, frames=[frame for frame in frames if frame["pattern"]["code"] == "phase"])
-    relit.done("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")
-    report = json.loads((copies[0] / "calibration.json").read_text())["procam"]
-    assert len(report["views"]) == 5 and report["rms_px"] < 0.3  # as with a white frame
-    assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    manifest, report = calibrated(relit, copies, *WORDS)
+    assert len(report["views"]) == 5 and report["rms_px"] < 0.3 and focal_off(manifest.projector, PROJECTOR) < 0.01  # as with white
 
 
 def test_poses_at_several_exposures_calibrate(relit, rig, tmp_path):
@@ -187,14 +175,12 @@ def test_poses_at_several_exposures_calibrate(relit, rig, tmp_path):
                 frames.append({"image": name, "pattern": frame["pattern"], "exposure_s": time})
         copies.append(tmp_path / folder.name)
         write_manifest(copies[-1], {"schema": "relit.capture/1", "name": "board", "frames": frames, "saturation": 0.999,
-                                    "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
-    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192"
-    relit.done("calibrate", "procam", *copies, *words)
-    report = json.loads((copies[0] / "calibration.json").read_text())["procam"]
+                                    "camera": PLAIN_CAMERA})
+    manifest, report = calibrated(relit, copies, *WORDS)
     assert len(report["views"]) == 5 and report["rms_px"] < 0.3  # as at one exposure
-    assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    assert focal_off(manifest.projector, PROJECTOR) < 0.01
     edit_manifest(copies[1], frames=json.loads((copies[1] / "capture.json").read_text())["frames"][1:])
-    assert "every pattern needs all exposures" in relit.refused("calibrate", "procam", *copies, *words)
+    assert "every pattern needs all exposures" in relit.refused("calibrate", "procam", *copies, *WORDS)
 
 
 def test_response_is_written_into_the_projector(relit, tmp_path):
@@ -261,7 +247,7 @@ def write_board(folder, poses):
             write_image(folder / f"{name}_{number}.png", np.rint(65535 * image).astype(np.uint16))
         frames.append({"image": f"left_{number}.png", "stereo": {"images": [f"right_{number}.png"]}})
     write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "frames": frames, "other_cameras": [UNKNOWN],
-                            "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
+                            "camera": PLAIN_CAMERA})
     return folder
 
 
@@ -278,13 +264,12 @@ def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
     further = scene(tmp_path)
     outcome = relit("depth", further, "--out", tmp_path / "out")
     assert outcome.code == 2 and "right has no focal_px and no camera_from_other" in outcome.err and "calibrate stereo" in outcome.err
-    outcome = relit.done("calibrate", "stereo", board, "--board", "9x6", "--square-m", 0.03, "--apply-to", further)
+    outcome = relit.done("calibrate", "stereo", board, *BOARD, "--apply-to", further)
     assert "px RMS, baseline 0.14" in outcome.out
     for folder in (board, further):
         manifest = Capture.open(folder).manifest
         other, = manifest.other_cameras
-        assert np.abs(np.array(manifest.camera.focal_px) / CAMERA.focal - 1).max() < 0.01
-        assert np.abs(np.array(other.focal_px) / OTHER.focal - 1).max() < 0.01
+        assert focal_off(manifest.camera, CAMERA) < 0.01 and focal_off(other, OTHER) < 0.01
         assert np.linalg.norm(np.array(other.camera_from_other)[:3, 3] - POSE[:3, 3]) < 0.004
         # what counts for matching: rows of the rectified images agree for true points in the middle of the field
         geometry = rectify(manifest.camera, other, where="")
@@ -306,7 +291,7 @@ def test_copies_of_a_frame_count_once(relit, board, tmp_path):
     for side in ("left", "right"):
         shutil.copy(folder / f"{side}_2.png", folder / f"{side}_9.png")
     edit_manifest(folder, frames=[*frames, {"image": "left_9.png", "stereo": {"images": ["right_9.png"]}}])
-    outcome = relit.done("calibrate", "stereo", folder, "--board", "9x6", "--square-m", 0.03)
+    outcome = relit.done("calibrate", "stereo", folder, *BOARD)
     assert "left_9.png: left out: a copy of left_2.png" in outcome.out
     other, = json.loads((folder / "calibration.json").read_text())["stereo"]["other_cameras"]
     assert len(other["views"]) == len(frames)
@@ -314,14 +299,13 @@ def test_copies_of_a_frame_count_once(relit, board, tmp_path):
 
 def test_what_is_wrong_with_several_cameras_is_said(relit, tmp_path):
     board = write_board(tmp_path / "board", 2)
-    given = "--board", "9x6", "--square-m", 0.03
     far = scene(tmp_path / "far")
     edit_manifest(far, other_cameras=[{**UNKNOWN, "name": "top"}])
     before = (board / "capture.json").read_text()
     for folder, arguments, says in (
-            (board, (*given, "--apply-to", far), "other_cameras: differ in name or resolution"),
+            (board, (*BOARD, "--apply-to", far), "other_cameras: differ in name or resolution"),
             (board, ("--board", "12x9", "--square-m", 0.03), "the camera: 0 of the views show the board"),
-            (scene(tmp_path / "bare", other_cameras=None, frames=[{"image": "left.png", "light": {"type": "full"}}]), given,
+            (scene(tmp_path / "bare", other_cameras=None, frames=[{"image": "left.png", "light": {"type": "full"}}]), BOARD,
              "frames: none has stereo images")):
         if folder.name == "bare":
             edit_manifest(folder)

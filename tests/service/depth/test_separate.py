@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.rig import read_truth
 from service.depth.separate import separate
 from service.requests.depth import SeparateRequest
 from stage.capture.capture import Capture
@@ -202,24 +203,21 @@ def rig(tmp_path_factory):
     separate(SeparateRequest(capture=RIG, out=out, cache=out, device="cpu"))
     channels, _ = exr.read(out / "separation.exr")
     direct, indirect = channels["direct.R"], channels["global.R"]
-    truth = {name: plane > 0.5 if name.endswith(".Y") else plane.astype(np.float64)
-             for name, plane in exr.read(RIG / "truth.exr")[0].items()}
-    capture = Capture.open(RIG)
-    clean = truth["mask.Y"] & ~truth["mixed.Y"]
+    truth, capture = read_truth(RIG / "truth.exr"), Capture.open(RIG)
     x, y = capture.camera.plane_coordinates()
-    points = np.stack([x, y, -np.ones_like(x)], axis=-1) * truth["depth.Z"][..., None]
-    normal = depth_normals(truth["depth.Z"].astype(np.float32), clean, capture.camera)
+    points = np.stack([x, y, -np.ones_like(x)], axis=-1) * truth.depth[..., None]
+    normal = depth_normals(truth.depth, truth.clean, capture.camera)
     pose = np.array(capture.manifest.projector.camera_from_projector)
     to_light = pose[:3, 3] - points
     given = (normal * to_light).sum(axis=-1) / (to_light @ pose[:3, 2]) ** 3  # planes that face it are evenly lit, 1 at 1 m
-    known = clean & (np.linalg.norm(normal, axis=-1) > 0.5)
+    known = truth.clean & (np.linalg.norm(normal, axis=-1) > 0.5)
     return direct, indirect, truth, given, known
 
 
 def test_the_groove_has_its_albedo_in_direct_light_alone(rig):
     """Its walls, of albedo 0.78 ± 0.05, light each other: white light makes them look brighter than any paint."""
     direct, indirect, truth, given, known = rig
-    groove = known & truth["groove.Y"]
+    groove = known & truth.groove
     albedo, under_white = direct[groove] / given[groove], (direct + indirect)[groove] / given[groove]
     assert np.median(albedo) == pytest.approx(0.78, abs=0.03)
     assert np.percentile(albedo, [5, 95]) == pytest.approx([0.73, 0.83], abs=0.06)
@@ -229,7 +227,7 @@ def test_the_groove_has_its_albedo_in_direct_light_alone(rig):
 def test_open_ground_has_little_global_light_and_shadow_no_direct(rig):
     direct, indirect, truth, _, known = rig
     share = indirect / np.maximum(direct + indirect, 1e-6)
-    assert np.median(share[known & ~truth["groove.Y"]]) < 0.04  # of which 1.6 % are the pixels of projector and camera, which blur 16 px
-    assert 0.2 < np.median(share[known & truth["groove.Y"]]) < 0.3
-    shadow = truth["shadow.Y"]
+    assert np.median(share[known & ~truth.groove]) < 0.04  # of which 1.6 % are the pixels of projector and camera, which blur 16 px
+    assert 0.2 < np.median(share[known & truth.groove]) < 0.3
+    shadow = truth.shadow
     assert np.median(direct[shadow]) < 0.002 < np.median(indirect[shadow])

@@ -1,13 +1,12 @@
 """Point sets that are in a set twice, written in another way, count once; two scans of one thing count twice."""
 
-import json
-
 import numpy as np
 import pytest
 
 from service.scans.duplicates import distinct
 from stage.formats.ply import PointCloud, write_ply
 from stage.sets.scan_set import read_scan_set
+from tests.scenes.statue import write_set
 
 SIGMA_M = 1e-4
 
@@ -33,8 +32,7 @@ def test_points_that_are_written_anew_count_once(tmp_path, again, keys, same):
     points = surface(0)
     write_ply(PointCloud(points.astype(np.float32), np.zeros(points.shape, np.uint8)), tmp_path / "first.ply")
     (tmp_path / "again.ply").write_text(ascii_ply(again))
-    (tmp_path / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "x", "scans": [
-        {"name": "first", "path": "first.ply"}, {"name": "again", "path": "again.ply", **keys}]}))
+    write_set(tmp_path, [{"name": "first", "path": "first.ply"}, {"name": "again", "path": "again.ply", **keys}])
     found = distinct(*read_scan_set(tmp_path))
     assert found.same_as == ({"again": "first"} if same else {})
     assert len(found.scans.scans) == (1 if same else 2)
@@ -46,7 +44,6 @@ def test_the_whole_scan_is_kept_of_its_thinned_copies(tmp_path):
     sets = {"thin": surface(0)[::2], "whole": surface(0), "thinner": surface(0)[::6], "other": surface(1)}
     for name, points in sets.items():
         (tmp_path / f"{name}.ply").write_text(ascii_ply(points))
-    (tmp_path / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "x", "scans": [
-        {"name": name, "path": f"{name}.ply"} for name in sets]}))
+    write_set(tmp_path, [{"name": name, "path": f"{name}.ply"} for name in sets])
     found = distinct(*read_scan_set(tmp_path))
     assert found.same_as == {"thin": "whole", "thinner": "whole"} and [scan.name for scan in found.scans.scans] == ["whole", "other"]

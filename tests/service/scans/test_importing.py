@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from service.scans.points.rigid import inverse
 from service.scans.viewpoints import find_viewpoints
 from stage.formats.ply import PointCloud, write_ply
+from tests.scenes.statue import write_set
 from tests.scenes.turntable import DISTANCE_M, View, figure, turntable
 from tests.service.scans.test_importing_formats import CORNER, POSE, ptx
 from tests.service.scans.test_register import off
@@ -127,8 +128,7 @@ def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, views):
 @pytest.mark.long
 def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, tmp_path, views):
     folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
-    (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "figure", "scans": [
-        {"name": f"s{number}", "path": f"scan_{24 * number}.ply"} for number in range(2)]}))
+    write_set(folder, [{"name": f"s{number}", "path": f"scan_{24 * number}.ply"} for number in range(2)])
     relit("register", folder, "--out", tmp_path / "out")
     said = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"] if (tmp_path / "out" / "report.json").exists() else []
     assert any("s0, s1: viewpoint_m is missing" in warning for warning in said)

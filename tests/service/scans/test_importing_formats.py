@@ -16,6 +16,13 @@ POSE = np.eye(4)
 POSE[:3, :3], POSE[:3, 3] = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix(), [4.0, 5, 6]
 
 
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "points"
+    folder.mkdir()
+    return folder
+
+
 def rows(*columns: np.ndarray) -> str:
     return "".join(" ".join(f"{value:.10g}" for value in row) + "\n" for row in np.column_stack(columns))
 
@@ -52,9 +59,7 @@ def pcd(points: np.ndarray, data: str, viewpoint: str) -> bytes:
     ("a.xyz", rows(CORNER, COLOURS, np.full(5, 255)), True), ("a.xyz", rows(CORNER, np.full(5, 300), COLOURS / 255), True),
     ("a.xyz", rows(CORNER, np.full(5, 7), COLOURS), True), ("a.pts", "5\n" + rows(CORNER, np.full(5, -900), COLOURS), True),
     ("a.pcd", pcd(CORNER, "ascii", "0 0 0"), True), ("a.pcd", pcd(CORNER, "binary", "0 0 0"), True)])
-def test_points_of_other_programs_become_scans(relit, tmp_path, name, content, coloured):
-    folder = tmp_path / "points"
-    folder.mkdir()
+def test_points_of_other_programs_become_scans(relit, tmp_path, folder, name, content, coloured):
     (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     relit.done("import", "scans", folder, tmp_path / "set", "--unit", "cm")
     cloud = read_ply(tmp_path / "set" / "a.ply")
@@ -64,9 +69,7 @@ def test_points_of_other_programs_become_scans(relit, tmp_path, name, content, c
     assert "are converted" in relit.refused("import", "scans", folder)
 
 
-def test_scanners_of_ptx_and_pcd_files_keep_their_places(relit, tmp_path):
-    folder = tmp_path / "points"
-    folder.mkdir()
+def test_scanners_of_ptx_and_pcd_files_keep_their_places(relit, tmp_path, folder):
     (folder / "tower.ptx").write_text(ptx(CORNER + 1, np.eye(4)) + ptx(CORNER + 1, POSE))
     (folder / "tower.pcd").write_bytes(pcd(CORNER + 1, "binary", "1 2 3"))
     said = relit.done("import", "scans", folder, tmp_path / "set").out
@@ -87,9 +90,7 @@ def write_e57(path, *scans):
             file.write_scan_raw(values, rotation=np.array(quaternion), translation=np.array(translation))
 
 
-def test_scanners_of_e57_files_keep_their_places(relit, tmp_path):
-    folder = tmp_path / "points"
-    folder.mkdir()
+def test_scanners_of_e57_files_keep_their_places(relit, tmp_path, folder):
     write_e57(folder / "hall.e57", (CORNER, [1.0, 0, 0, 0], [0.0, 0, 0]), (CORNER + 1, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], [5.0, 6, 7]))
     assert f"relit import scans {folder}" in relit.done("import", "guess", folder).out
     said = relit.done("import", "scans", folder, tmp_path / "set").out
@@ -103,10 +104,8 @@ def test_scanners_of_e57_files_keep_their_places(relit, tmp_path):
     assert "E57 files are in metres" in relit.refused("import", "scans", folder, tmp_path / "other", "--unit", "mm")
 
 
-def test_spherical_coordinates_of_e57_files_are_those_of_the_standard(relit, tmp_path, monkeypatch):
+def test_spherical_coordinates_of_e57_files_are_those_of_the_standard(relit, tmp_path, folder, monkeypatch):
     """pye57 writes no spherical coordinates, so what it reads is put in their place: range, azimuth from x, elevation from the plane."""
-    folder = tmp_path / "points"
-    folder.mkdir()
     write_e57(folder / "a.e57", (CORNER + 1, [1.0, 0, 0, 0], [0.0, 0, 0]))
     x, y, z = (CORNER + 1).T
     values = {"sphericalRange": np.sqrt(x * x + y * y + z * z), "sphericalAzimuth": np.arctan2(y, x),
@@ -117,19 +116,15 @@ def test_spherical_coordinates_of_e57_files_are_those_of_the_standard(relit, tmp
     assert read_ply(tmp_path / "set" / "a.ply").points == pytest.approx(CORNER + 1, rel=1e-6)
 
 
-def test_without_pye57_the_extra_is_named(relit, tmp_path, monkeypatch):
-    folder = tmp_path / "points"
-    folder.mkdir()
+def test_without_pye57_the_extra_is_named(relit, tmp_path, folder, monkeypatch):
     (folder / "a.e57").write_bytes(b"ASTM-E57")
     assert "a.e57: is no E57 file" in relit.refused("import", "scans", folder, tmp_path / "set")
     monkeypatch.setattr("stage.formats.e57.find_spec", lambda name: None)
     assert "pip install 'relit[e57]'" in relit.refused("import", "scans", folder, tmp_path / "set")
 
 
-def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path):
+def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path, folder):
     """LAS has millimetres of places half a million metres away, which floats of 32 bits hold to 3 cm."""
-    folder = tmp_path / "points"
-    folder.mkdir()
     far, flat = np.array([512345.0, 5412345.0, 431.0]), np.zeros(5)
     for number in range(2):
         write_las(CORNER + far + number, flat, flat, np.arange(5), flat, folder / f"s{number}.las")
@@ -149,9 +144,7 @@ def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path):
     ("a.ptx", ptx(CORNER, POSE).rsplit("\n", 2)[0].encode(), "truncated"),
     ("a.pcd", b"DATA binary\n", "header"), ("a.pcd", pcd(CORNER, "binary_compressed", "0 0 0"), "ascii or binary"),
     ("a.pcd", pcd(CORNER, "binary", "0 0 0")[:-4], "truncated"), ("a.las", b"LAS?", "LAS")])
-def test_what_is_wrong_with_points_is_said(relit, tmp_path, name, content, named):
-    folder = tmp_path / "points"
-    folder.mkdir()
+def test_what_is_wrong_with_points_is_said(relit, tmp_path, folder, name, content, named):
     (folder / name).write_bytes(content)
     said = relit.refused("import", "scans", folder, tmp_path / "set")
     assert name in said and named in said

@@ -1,6 +1,5 @@
 """The reader of scan sets: depth results and PLY files give points, σ along the line of sight, normals, colours and poses."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from stage.formats.ply import PointCloud, write_ply
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from stage.sets.scan_set import read_scan_set
+from tests.scenes.statue import write_set
 
 SIZE, RADIUS, SIGMA = 96, 0.25, 2e-4
 CAMERAS = {"perspective": Camera(projection="perspective", resolution=(SIZE, SIZE), focal_px=(120.0, 120.0)),
@@ -47,8 +47,7 @@ def write(folder: Path, name: str, kind: str = "perspective", *, sigma: bool = T
 
 
 def read(folder: Path, *scans: dict) -> list[Scan]:
-    (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "ball", "scans": list(scans)}))
-    file, listed = read_scan_set(folder)
+    file, listed = read_scan_set(write_set(folder, list(scans)))
     return [read_scan(file, listed, number) for number in range(len(listed.scans))]
 
 
@@ -128,9 +127,4 @@ def test_a_depth_without_sigma_has_one_that_is_estimated(tmp_path):
     depths.mask[:] = False
     depths.write(tmp_path / "empty" / "depth.exr")
     with pytest.raises(ManifestError, match=r"scans\[0\] \(e\): no pixel of .* has a depth with a σ"):
-        read_scan(*read_scan_set_of(tmp_path, {"name": "e", "path": "empty"}), 0)
-
-
-def read_scan_set_of(folder: Path, *scans: dict):
-    (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "ball", "scans": list(scans)}))
-    return read_scan_set(folder)
+        read(tmp_path, {"name": "e", "path": "empty"})

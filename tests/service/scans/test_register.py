@@ -69,8 +69,7 @@ def table_of(seen: tuple[View, ...], *angles: float, **further) -> dict:
 @pytest.mark.long
 def test_scans_without_poses_come_together(relit, tmp_path):
     seen = views(figure, 0, 30, 60, 100, 150)
-    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
     assert "joined   5 of 5 scans" in outcome.out
     wrong = off(tmp_path / "out", seen)
     assert len(wrong) == 5
@@ -112,8 +111,7 @@ def test_poses_of_the_file_are_starts(relit, tmp_path):
         start = view.world_from_scan @ np.eye(4)
         start[:3, 3] += 8 * MM * (number > 0)
         rough[f"s{number}"] = {"scan_to_world": start.tolist()}
-    outcome = relit("register", write(tmp_path / "set", seen, **rough), "--out", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
+    relit.done("register", write(tmp_path / "set", seen, **rough), "--out", tmp_path / "out")
     assert max(shift for shift, _ in off(tmp_path / "out", seen).values()) < 0.2 * MM
     _, found = read_scan_set(tmp_path / "out")
     np.testing.assert_allclose(found.scans[0].scan_to_world, seen[0].world_from_scan, atol=1e-12)  # the reference stays where it is
@@ -175,8 +173,7 @@ def test_the_angles_of_a_turntable_are_refined(relit, tmp_path, given):
     table = table_of(seen, *(given or ()))
     if given is None:
         del table["turntable"]["angles_deg"]
-    outcome = relit("register", write(tmp_path / "set", seen, top=table), "--out", tmp_path / "out", "--turntable", "angles")
-    assert outcome.code == 0, outcome.err
+    relit.done("register", write(tmp_path / "set", seen, top=table), "--out", tmp_path / "out", "--turntable", "angles")
     wrong = off(tmp_path / "out", seen)
     assert max(shift for shift, _ in wrong.values()) < 1e-3 * MM  # the axis holds the middle
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -199,13 +196,11 @@ def test_a_wrong_axis_of_a_turntable_is_named(relit, tmp_path):
 def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
     seen = views(figure, 0, 30, 60)
     folder = write(tmp_path / "set", seen, top=table_of(seen, 0, 30, 60))
-    outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
     assert "ask for poses" not in outcome.out + outcome.err
     assert max(shift for shift, _ in off(tmp_path / "out", seen).values()) < 1e-9
     folder = write(tmp_path / "bad", seen, top=table_of(seen, 0, 30, 61))
-    outcome = relit("register", folder, "--out", tmp_path / "out2", "--turntable", "fixed")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", folder, "--out", tmp_path / "out2", "--turntable", "fixed")
     assert "s1 and s2: their surfaces ask for poses that are" in outcome.out + outcome.err
 
 
@@ -213,13 +208,11 @@ def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
 def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
     seen = views(vase, 0, 40, 80)
     outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
-    assert outcome.code == 2
-    assert "the surface looks the same when it is turned about an axis" in outcome.err
+    assert outcome.code == 2 and "the surface looks the same when it is turned about an axis" in outcome.err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert {pair["state"] for pair in report["pairs"]} == {"ambiguous"} and not (tmp_path / "out" / "scan-set.json").exists()
     folder = write(tmp_path / "turned", seen, top=table_of(seen, 0, 40, 80))
-    outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
     assert "nothing checks the turntable" in outcome.out + outcome.err
 
 
@@ -227,8 +220,7 @@ def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
 def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
     seen = views(urn, 0, 90)
     assert "fits as well when it is turned" in relit.refused("register", write(tmp_path / "set", seen), "--out", tmp_path / "none")
-    outcome = relit("register", tmp_path / "set", "--out", tmp_path / "out", "--accept", "look-alike")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", tmp_path / "set", "--out", tmp_path / "out", "--accept", "look-alike")
     assert "s0, s1: look much the same when they are turned about an" in outcome.out + outcome.err
     assert json.loads((tmp_path / "out" / "report.json").read_text())["alike_turned"] == ["s0", "s1"]
     assert json.loads((tmp_path / "out" / "report.json").read_text())["scans"][1]["pose_sigma_degrees"] > 45
@@ -290,5 +282,4 @@ def test_the_input_is_not_replaced_and_one_scan_is_refused(relit, tmp_path):
 
 def test_without_small_gicp_the_extra_is_named(relit, tmp_path, monkeypatch):
     monkeypatch.setattr("service.scans.register.neighbours_are_installed", lambda: False)
-    outcome = relit("register", write(tmp_path / "set", views(figure, 0, 30)), "--out", tmp_path / "out")
-    assert outcome.code == 2 and "pip install 'relit[scans]'" in outcome.err
+    relit("register", write(tmp_path / "set", views(figure, 0, 30)), "--out", tmp_path / "out").refused("pip install 'relit[scans]'")

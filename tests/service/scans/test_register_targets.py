@@ -39,8 +39,7 @@ def targets(**changed: np.ndarray) -> dict:
 
 def test_a_vase_is_placed_by_targets_and_one_that_moved_is_named(relit, tmp_path):
     folder = write(tmp_path / "set", views(), **targets(T1=PLACES["T1"] + [0, 0.003, 0]))
-    outcome = relit("register", folder, "--out", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("register", folder, "--out", tmp_path / "out")
     assert max(shift for shift, _ in off(tmp_path / "out", views()).values()) < 0.5 * MM  # five σ of targets of .1 mm half a metre away
     assert "target T1: in s2 it lies 3" in outcome.err + outcome.out
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -63,8 +62,7 @@ def test_bad_targets_are_refused_by_their_field(relit, tmp_path, target, words):
 
 def test_a_target_is_listed_once(relit, tmp_path):
     one = {"name": "T0", "position_m": [0, 0, 1], "sigma_m": 1e-4}
-    outcome = relit("register", write(tmp_path / "set", views(), s0={"targets": [one, one]}), "--out", tmp_path / "out")
-    assert outcome.code == 2 and "T0 is there twice" in outcome.err
+    relit("register", write(tmp_path / "set", views(), s0={"targets": [one, one]}), "--out", tmp_path / "out").refused("T0 is there twice")
 
 
 @cache
@@ -92,8 +90,7 @@ def write_walls(folder, kind: str, *, images: bool = True):
     ("aruco4", ("--markers", "aruco4")), pytest.param("board", ("--board", "7x6"), marks=pytest.mark.long)])
 def test_a_flat_wall_is_placed_by_the_marks_that_its_images_show(relit, tmp_path, kind, option):
     folder = write_walls(tmp_path / "set", kind)
-    outcome = relit("register", folder, "--out", tmp_path / "out", *option)
-    assert outcome.code == 0, outcome.err
+    relit.done("register", folder, "--out", tmp_path / "out", *option)
     _, found = read_scan_set(tmp_path / "out")
     world = np.array(found.scans[0].scan_to_world) @ inverse(POSES[0])
     for entry, pose in zip(found.scans, POSES, strict=True):

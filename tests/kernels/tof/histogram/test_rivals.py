@@ -13,7 +13,7 @@ from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import estimate_pulses
 from service.depth.tof.count_scale import estimate_count_scale
 from service.depth.tof.histograms import interlaced
-from service.depth.tof.shared_bins import pattern_bins
+from service.depth.tof.shared_light import pattern_bins
 from tests.reference import tof
 
 BINS = 64

@@ -101,7 +101,6 @@ def test_a_mirrored_camera_whose_corners_are_found_from_the_other_end_is_named()
 @pytest.mark.long
 @pytest.mark.parametrize(("aspect", "words"), [(1.01, "1 % taller than wide"), (0.985, "1.5 % wider than tall")])
 def test_a_print_whose_squares_are_none_is_named(aspect, words):
-    """Depths were wrong by twice what was stated where the board stays upright, and by 4 % where it is turned in its plane."""
     random, frames = np.random.default_rng(3), []
     for number in range(8):
         turn = Rotation.from_euler("zyx", random.uniform(-0.5, 0.5, 3) * [0.4, 1, 1]).as_matrix()

@@ -24,11 +24,8 @@ def poses(count):
     """[count] of [4, 4] camera_from_board: turned about both axes, before the camera."""
     rng = np.random.default_rng(11)
     for _ in range(count):
-        a, b = rng.uniform(-0.5, 0.5, 2)
-        turn_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-        turn_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
         matrix = np.eye(4)
-        matrix[:3, :3] = turn_y @ turn_x
+        matrix[:3, :3] = Rotation.from_euler("YX", rng.uniform(-0.5, 0.5, 2)).as_matrix()
         matrix[:3, 3] = [rng.uniform(-0.05, 0.05), rng.uniform(-0.04, 0.04), rng.uniform(-1.0, -0.8)]
         yield matrix
 

@@ -9,10 +9,9 @@ import pytest
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.pattern_checks import Sample
 from stage.capture.manifest import Frame
 from stage.patterns.codes import collect
-from tests.scenes.depth import AMBIENT, BLACK_WHITE, PROJECTOR, gray_patterns, make_scene, phase_patterns, shown
+from tests.scenes.depth import BLACK_WHITE, PROJECTOR, gray_patterns, grey_light, make_scene, phase_patterns, sample_of
 
 SIZE = PROJECTOR.width, PROJECTOR.height
 NOISE = 0.004
@@ -38,12 +37,10 @@ def scene():
 def said(scene, patterns, declared, size=SIZE):
     """The sentence about these frames, with noise, of every second row."""
     rng = np.random.default_rng(2)
-    frames = [scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv) * ~scene.shaded + AMBIENT) for pattern in patterns]
-    values = (np.array(frames) + rng.normal(0, NOISE, (len(frames), *scene.depth.shape)))[:, ::2].astype(np.float32)
-    rows = np.zeros(values.shape[1:], np.float32)
-    sample = Sample(values.reshape(len(frames), 1, -1), None, rows, rows, np.ones(rows.shape, bool))
+    values = grey_light(scene, patterns)
+    values = (values + rng.normal(0, NOISE, values.shape))[:, ::2]
     entries = [Frame.model_validate({"image": "a.png", "pattern": pattern}).pattern for pattern in declared]
-    return check_codes(sample, collect(entries), PatternProjector(size), NoiseModel(NOISE, 0.0))
+    return check_codes(sample_of(values), collect(entries), PatternProjector(size), NoiseModel(NOISE, 0.0))
 
 
 def changed(patterns, code, **fields):
@@ -82,7 +79,6 @@ def test_any_two_bits_that_are_exchanged_are_named(scene, swap):
 @pytest.mark.parametrize("base", [3, 4, 5])
 @pytest.mark.parametrize("reflected", [False, True])
 def test_digits_that_are_declared_otherwise_are_named(scene, base, reflected):
-    """Half of the depths were off by many stripes, without a word."""
     right = kary(base, reflected=reflected)
     assert f"reflected is {str(reflected).lower()}" in said(scene, right, kary(base, reflected=not reflected))
     exchanged = changed(right, "kary", digit=lambda p: {0: 1, 1: 0}.get(p["digit"], p["digit"]))

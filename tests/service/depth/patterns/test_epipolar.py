@@ -5,26 +5,21 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.depth.base.epipolar import contradiction
-from service.depth.patterns.projector_doubts import ALIKE, LEAST_PX
+from service.depth.patterns.agreement import ALIKE, LEAST_PX
 from stage.capture.projector import Projector
 from stage.results.depth_maps import DepthMaps
 from tests.marks import first_short
-from tests.scenes.captures import write_image
+from tests.scenes.captures import edit_manifest, write_images, write_manifest
+from tests.scenes.depth import entries_of, phase_patterns, shown
 
 SIZE, FOCAL, PROJECTED, LENS = (150, 110), 170.0, (200, 150), 230.0
 RIGS = {"right": ((0.25, 0.02, 0.0), 1.2), "left above": ((-0.3, 0.15, 0.05), 1.6), "above": ((0.03, 0.28, -0.02), 1.4)}
 WRONG = {"yaw": ((0.0, 1.0, 0.0), 1.0), "roll": ((0.0, 0.0, 1.0), 1.0), "pitch": ((-0.5, 0.0, 0.0), 1.0), "focal": ((0.0, 0.0, 0.0), 1.04)}
 ASIDE = 3.5
 """Pixels by which a principal point is wrong, 1.5 % of the focal length."""
-
-
-def turn(degrees):
-    x, y, z = np.radians(degrees)
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    return about_x @ about_y @ np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
 
 
 def scene(rig, seed):
@@ -56,7 +51,7 @@ def declared(pose, wrong=None):
     """The projector of a manifest, turned and zoomed by what WRONG has."""
     degrees, zoom = WRONG.get(wrong, ((0, 0, 0), 1.0))
     other = pose.copy()
-    other[:3, :3] = pose[:3, :3] @ turn(degrees)
+    other[:3, :3] = pose[:3, :3] @ Rotation.from_euler("XYZ", degrees, degrees=True).as_matrix()
     return {"resolution": PROJECTED, "focal_px": [LENS * zoom] * 2, "camera_from_projector": other.tolist()}
 
 
@@ -118,19 +113,14 @@ def written(folder, wrong):
     random = np.random.default_rng(1)
     y, x = np.mgrid[:SIZE[1], :SIZE[0]]
     albedo = 0.55 + 0.2 * np.sin(x / 2.5) * np.sin(y / 3.5) + 0.1 * (np.sin(x / 11 + y / 17) > 0)
-    frames = []
-    for axis, name in enumerate(("column", "row")):
-        for period in (20.0, 23.0):
-            for step in range(4):
-                level = 0.5 + 0.5 * np.cos(2 * np.pi * (uv[..., axis] / period - step / 4))
-                light = albedo * (0.05 + 0.8 * level)
-                light = np.clip(light + 0.02 * np.sqrt(light + 0.01) * 0.3 * random.standard_normal(light.shape), 0, 1)
-                write_image(folder / f"{len(frames):02d}.png", light[..., None] * np.ones(3))
-                frames.append({"image": f"{len(frames):02d}.png", "pattern": {"code": "phase", "axis": name, "period_px": period,
-                                                                              "steps": 4, "step": step}})
-    (folder / "capture.json").write_text(json.dumps({
-        "schema": "relit.capture/1", "name": "waves", "color_space": "lin_rec709_scene", "frames": frames,
-        "camera": {"projection": "perspective", "resolution": SIZE, "focal_px": [FOCAL, FOCAL]}, "projector": declared(pose, wrong)}))
+    images, patterns = [], [wave for axis in ("column", "row") for period in (20.0, 23.0) for wave in phase_patterns(axis, period)]
+    for pattern in patterns:
+        light = albedo * (0.05 + 0.8 * shown(pattern, uv))
+        images.append(light + 0.02 * np.sqrt(light + 0.01) * 0.3 * random.standard_normal(light.shape))
+    write_manifest(folder, {
+        "schema": "relit.capture/1", "name": "waves", "color_space": "lin_rec709_scene",
+        "frames": write_images(folder, images, entries_of(patterns), "{:02d}.png"),
+        "camera": {"projection": "perspective", "resolution": SIZE, "focal_px": [FOCAL, FOCAL]}, "projector": declared(pose, wrong)})
     return -points[..., 2]
 
 
@@ -170,9 +160,8 @@ def test_a_projector_is_refined(relit, tmp_path, wrong):
 
 def test_what_cannot_be_refined_is_refused(relit, tmp_path):
     written(tmp_path, None)
-    manifest = json.loads((tmp_path / "capture.json").read_text())
-    manifest["frames"] = [frame for frame in manifest["frames"] if frame["pattern"]["axis"] == "column"]
-    (tmp_path / "capture.json").write_text(json.dumps(manifest))
+    frames = json.loads((tmp_path / "capture.json").read_text())["frames"]
+    edit_manifest(tmp_path, frames=[frame for frame in frames if frame["pattern"]["axis"] == "column"])
     relit("depth", tmp_path, "--out", tmp_path / "out", "--refine-projector").refused("one axis alone")
 
 
@@ -180,9 +169,8 @@ def test_what_cannot_be_refined_is_refused(relit, tmp_path):
 def test_a_lens_that_no_turn_explains_is_not_taken_for_one(relit, tmp_path, k):
     """As where boards were in the middle of the image alone: a projector turned by 30°, or of a negative focal length, was named."""
     written(tmp_path, None)
-    manifest = json.loads((tmp_path / "capture.json").read_text())
-    manifest["projector"]["distortion"] = {"model": "brown_conrady", "k": [*k, 0.0]}
-    (tmp_path / "capture.json").write_text(json.dumps(manifest))
+    pose = scene("right", 8)[1]
+    edit_manifest(tmp_path, projector={**declared(pose), "distortion": {"model": "brown_conrady", "k": [*k, 0.0]}})
     outcome = relit("depth", tmp_path, "--out", tmp_path / "out", "--device", "cpu", "--read-noise", "0.003", "--least-confidence", "0")
     assert outcome.code in (0, 1), outcome.err
     said = " ".join(json.loads((tmp_path / "out" / "report.json").read_text())["warnings"])

@@ -1,19 +1,18 @@
-"""Frames that hold part of the next pattern are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
+"""Frames that hold part of the next pattern are named, and no depth is believed: the scene and the images of tests/scenes/depth.py. What
+moves during a sequence is told from what stands still, under projectors of any response: a dark strip that shifts half way."""
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.depth import depth
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.levels import check_levels
-from service.depth.patterns.pattern_checks import Sample
-from service.requests.depth import DepthRequest
+from service.depth.patterns.levels import EvenSums, check_levels
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
-from tests.scenes.captures import write_image, write_images, write_manifest
-from tests.scenes.depth import AMBIENT, entries_of, gray_patterns, make_scene, manifest, phase_patterns, shown
+from stage.patterns.phase import phase_patterns as waves
+from tests.scenes.captures import write_image, write_manifest
+from tests.scenes.depth import depth_of, depth_under, gray_patterns, grey_light, make_scene, manifest, phase_patterns, sample_of, shown
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 SEVERAL = [*phase_patterns("column", 16.0), *phase_patterns("column", 18.0), *phase_patterns("column", 21.0)]
@@ -26,42 +25,40 @@ def scene():
     return make_scene()
 
 
+def mixed(result):
+    """Whether frames are said to mix patterns."""
+    return any("levels that no pattern has" in sentence for sentence in result.warnings)
+
+
 def measured(folder, scene, patterns, part, *, gamma=1.0):
     """What relit depth makes of frames of which each holds this part of the next one, recorded by a camera of this exponent."""
-    rng = np.random.default_rng(4)
-    light = np.array([scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv) * ~scene.shaded + AMBIENT) for pattern in patterns])
-    light = ((1 - part) * light + part * np.roll(light, -1, axis=0)) ** gamma
-    write_manifest(folder, manifest(write_images(folder, light + rng.normal(0, NOISE, light.shape), entries_of(patterns))))
-    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+    light = grey_light(scene, patterns)
+    return depth_under(folder, patterns, ((1 - part) * light + part * np.roll(light, -1, axis=0)) ** gamma)
 
 
 @pytest.mark.parametrize("patterns", [NUMBERED, SEVERAL], ids=["numbered", "several"])
 @pytest.mark.parametrize("part", [0.2, 0.3])
 def test_frames_that_mix_two_patterns_are_named(tmp_path, scene, patterns, part):
     result = measured(tmp_path, scene, patterns, part)
-    assert not result.maps.mask.any()
-    assert any("levels that no pattern has" in sentence for sentence in result.warnings)
+    assert not result.maps.mask.any() and mixed(result)
 
 
 @pytest.mark.parametrize(("patterns", "gamma"), [(NUMBERED, 1.0), (SEVERAL, 1.0), (NUMBERED, 1.8)],
                          ids=["numbered", "several", "a camera that is not linear"])
 def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
     result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)
-    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
+    assert not mixed(result)
     assert gamma != 1.0 or result.maps.mask[~scene.shaded].mean() > 0.9
 
 
 def test_three_steps_of_a_declared_response_raise_no_doubt(tmp_path, scene):
     """Three shifts do not even out the third harmonic of a response that is steep in the middle: their sums differ as it says."""
-    level = np.array([shown(pattern, scene.uv) for pattern in THREE])
-    light = scene.albedo[..., 1] * (0.8 * level**2 * (3 - 2 * level) * ~scene.shaded + AMBIENT)
-    light = light + np.random.default_rng(4).normal(0, NOISE, level.shape)
-    data, levels = manifest(write_images(tmp_path, light, entries_of(THREE))), np.linspace(0, 1, 33)
-    data["projector"]["response"] = (levels**2 * (3 - 2 * levels)).tolist()
-    write_manifest(tmp_path, data)
-    result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
-    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
-    assert result.maps.mask[~scene.shaded].mean() > 0.9
+    def steep(level):
+        return level**2 * (3 - 2 * level)
+
+    projector = {**manifest([])["projector"], "response": steep(np.linspace(0, 1, 33)).tolist()}
+    result = depth_under(tmp_path, THREE, grey_light(scene, THREE, response=steep), changes={"projector": projector})
+    assert not mixed(result) and result.maps.mask[~scene.shaded].mean() > 0.9
 
 
 def test_frames_that_are_clipped_are_not_called_mixed(tmp_path, scene):
@@ -74,8 +71,7 @@ def test_frames_that_are_clipped_are_not_called_mixed(tmp_path, scene):
         write_image(tmp_path / name, np.repeat(np.rint(np.clip(light, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=-1))
         frames.append({"image": name, "pattern": pattern})
     write_manifest(tmp_path, manifest(frames, color_space="lin_rec709_scene"))
-    result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
-    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
+    assert not mixed(depth_of(tmp_path))
 
 
 def stripes_said(*, part=0.0, blur_px=0.6, gamma=1.0, dimmed_white=1.0):
@@ -88,9 +84,7 @@ def stripes_said(*, part=0.0, blur_px=0.6, gamma=1.0, dimmed_white=1.0):
     light[[pattern.code == "white" for pattern in patterns]] *= dimmed_white
     light = gaussian_filter1d((1 - part) * light + part * np.roll(light, -1, axis=0), blur_px, axis=2)
     frames = albedo * (0.7 * light + 0.04)
-    frames = (frames + rng.normal(0, NOISE, frames.shape)).astype(np.float32)
-    empty = np.zeros(x.shape, np.float32)
-    sample = Sample(frames.reshape(len(frames), 1, -1), None, empty, empty, np.ones(x.shape, bool))
+    sample = sample_of(frames + rng.normal(0, NOISE, frames.shape))
     return check_levels(sample, collect(patterns), PatternProjector((320, 240)), NoiseModel(NOISE, 0.0))
 
 
@@ -103,3 +97,55 @@ def test_stripes_of_mixed_frames_are_neither_dark_nor_bright(part):
                          ids=["sharp", "out of focus", "gamma", "inverse gamma", "a display that dims white"])
 def test_stripes_of_whole_frames_raise_no_doubt(scene):
     assert stripes_said(**scene) is None
+
+
+ROWS, COLS, EXTENT = 32, 120, 256
+AT = np.arange(COLS) + np.zeros((ROWS, 1))
+SHOT = NoiseModel(NOISE, 1e-4)
+STRIPES = list(binary_patterns(EXTENT, "column", stripe_px=8))
+both = pytest.mark.parametrize("patterns", [[*waves("column", (16.0,), 3), *STRIPES], STRIPES], ids=["waves and stripes", "stripes alone"])
+
+
+def sums_of(patterns, seen, gamma=1.0, full=np.inf):
+    """The even sums, and their sample, of frames of which `seen` gives albedos and columns of the projector; its argument: whether the
+    frame is one of the second half."""
+    values = []
+    for number, pattern in enumerate(patterns):
+        albedo, u = seen(number >= len(patterns) // 2)
+        values.append(albedo * (0.8 * pattern.level(u, u, EXTENT) ** gamma + 0.05))
+    values = np.array(values)
+    values = values + np.random.default_rng(3).normal(0, 1, values.shape) * np.sqrt(SHOT.read**2 + SHOT.gain * values)
+    sample = sample_of(values, full)
+    return EvenSums.of(sample, collect(patterns), SHOT), sample
+
+
+def moved(by_px, gamma=1.0, full=np.inf, patterns=STRIPES):
+    """Where frames, in the second half of which a dark strip stands farther right, show motion; and where it does."""
+    def seen(later):
+        left = 50 + 3 * np.sin(np.arange(ROWS) / 4)[:, None] + by_px * later
+        strip = np.abs(AT - left - 10) < 10
+        return np.where(strip, 0.15, 0.6 + 0.2 * np.sin(0.4 * AT)), 20 + 1.6 * AT - 30 * strip
+
+    sums, sample = sums_of(patterns, seen, gamma, full)
+    return sums.moved(sample, SHOT), (np.abs(seen(False)[0] - seen(True)[0]) > 0.2).ravel()
+
+
+@both
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_what_moves_is_found_and_what_stands_still_has_not_moved(gamma, patterns):
+    """Six deviations of noise: none of 3840 pixels by chance."""
+    found, truth = moved(4, gamma, patterns=patterns)
+    assert found[truth].mean() > 0.9 and found[~truth].mean() < 0.01
+    assert not moved(0, gamma, patterns=patterns)[0].any()
+
+
+def test_clipped_highlights_that_stand_still_have_not_moved():
+    """The mean of a wave whose crests are clipped falls below half of white at the brighter half of the surface."""
+    assert not moved(0, full=0.5, patterns=[*waves("column", (16.0,), 3), *STRIPES])[0].any()
+
+
+@pytest.mark.parametrize(("by_px", "everywhere"), [(0.0, False), (8.0, True)])
+def test_a_whole_scene_that_moves_is_told_from_single_things(by_px, everywhere):
+    """Stripes of paint pass by their own width in the middle of the sequence: every pixel changes."""
+    sums, _ = sums_of(STRIPES, lambda later: (0.5 + 0.3 * np.sign(np.sin(np.pi * (AT - by_px * later) / 8)), 20 + 1.6 * AT))
+    assert sums.everywhere is everywhere

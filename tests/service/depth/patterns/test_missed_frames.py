@@ -1,15 +1,11 @@
 """Frames that the projector missed are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
 
-from shutil import copyfile
-
 import numpy as np
 import pytest
 
-from service.depth.depth import depth
-from service.requests.depth import DepthRequest
 from tests.marks import first_short
-from tests.scenes.captures import write_image, write_images, write_manifest
-from tests.scenes.depth import AMBIENT, BLACK_WHITE, entries_of, gray_patterns, make_scene, manifest, phase_patterns, shown
+from tests.scenes.captures import write_image
+from tests.scenes.depth import AMBIENT, BLACK_WHITE, depth_under, gray_patterns, grey_light, make_scene, phase_patterns
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 INVERSES = gray_patterns("column", stripe=2)
@@ -31,19 +27,18 @@ def scene():
 def measured(folder, scene, patterns, *, dark=(), again=(), copies=None, columns=None, noise=NOISE):
     """What relit depth says of frames of which some are dark, some show once more what the frame before shows, and some are the files of
     others, and what it makes of some columns of them."""
-    rng = np.random.default_rng(4)
-    images, before = [], np.zeros(scene.depth.shape)
-    for number, pattern in enumerate(patterns):
-        before = before if number in again else shown(pattern, scene.uv) * (number not in dark)
-        images.append(scene.albedo[..., 1] * (0.8 * before * ~scene.shaded + AMBIENT) + noise * rng.normal(0, 1, before.shape))
-    frames = write_images(folder, images, entries_of(patterns), "{:02d}.exr")
+    light = grey_light(scene, patterns)
+    for number in dark:
+        light[number] = scene.albedo[..., 1] * AMBIENT
+    for number in again:
+        light[number] = light[number - 1]
+    light += np.random.default_rng(4).normal(0, noise, light.shape)
     for number, source in (copies or {}).items():
-        copyfile(folder / f"{source:02d}.exr", folder / f"{number:02d}.exr")
+        light[number] = light[source]
     mask = np.zeros(scene.depth.shape, np.uint8)
     mask[:, columns or slice(None)] = 255
     write_image(folder / "mask.png", mask)
-    write_manifest(folder, manifest(frames, mask="mask.png"))
-    result = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+    result = depth_under(folder, patterns, light, noise=0, changes={"mask": "mask.png"})
     return [warning for warning in result.warnings if "missed" in warning or "copy" in warning], result.maps.mask
 
 

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.projected_scenes import Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
-from stage.results.depth_maps import DepthMaps
+from tests.scenes.depth import depth_of
 
 RIG = Rig(camera=(150, 80), camera_focal=195.0, projector=(256, 144), projector_focal=330.0)
 PIXEL = 1.0 / RIG.camera_focal
@@ -29,13 +29,11 @@ def seen():
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", PATTERNS)
-def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(relit, tmp_path, seen, name):
+def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(tmp_path, seen, name):
     light, wall = seen
     world = World(shapes=(WALL, *WIRES), rig=RIG)
     write_capture(tmp_path, world, PATTERNS[name], light=light)
-    relit("depth", tmp_path, "--out", tmp_path / "out", "--device", "cpu", "--read-noise", world.read_noise, "--photon-gain",
-          1 / world.electrons).well()
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps = depth_of(tmp_path, read_noise=world.read_noise, photon_gain=1 / world.electrons).maps
     column = (np.arange(RIG.camera[0]) + 0.5 - RIG.camera[0] / 2) * PIXEL  # of the plane of the wires, metres
     near = np.min([np.abs(column - wire.point_m[0]) for wire in WIRES], axis=0) < 1.5 * PIXEL
     solved = maps.mask & near & np.isfinite(wall)

@@ -9,7 +9,7 @@ import pytest
 from stage.formats import exr
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import phase_patterns
-from tests.scenes.captures import write_exr, write_image
+from tests.scenes.captures import edit_manifest, write_image, write_images, write_manifest
 
 WIDTH, ROWS, COLS = 256, 48, 160
 TIMES = (0.01, 0.16)
@@ -39,15 +39,13 @@ def photographs(times, seed=1):
     return found
 
 
-def capture(folder, times, *, bits=16, **fields):
-    frames = []
-    for number, (pattern, time, image) in enumerate(photographs(times)):
-        full = (1 << bits) - 1
-        write_image(folder / f"{number:03d}.png", np.rint(image * full).astype(np.uint8 if bits == 8 else np.uint16))
-        frames.append({"image": f"{number:03d}.png", "exposure_s": time, "pattern": pattern.model_dump(mode="json", exclude_none=True)})
+def capture(folder, times, names="{:03d}.png", **fields):
+    taken = photographs(times)
+    entries = [{"exposure_s": time, "pattern": pattern.model_dump(mode="json", exclude_none=True)} for pattern, time, _ in taken]
     manifest = {"schema": "relit.capture/1", "name": "steps", "camera": {"projection": "orthographic", "resolution": [COLS, ROWS]},
-                "projector": {"resolution": [WIDTH, 64]}, "saturation": 1.0, "frames": frames, **fields}
-    (folder / "capture.json").write_text(json.dumps(manifest))
+                "projector": {"resolution": [WIDTH, 64]}, "saturation": 1.0,
+                "frames": write_images(folder, [image for _, _, image in taken], entries, names), **fields}
+    write_manifest(folder, {key: value for key, value in manifest.items() if value is not None})
     return folder
 
 
@@ -90,19 +88,13 @@ def test_sigma_falls_with_what_is_gathered(relit, tmp_path):
 
 def test_a_pattern_without_an_exposure_is_named(relit, tmp_path):
     folder = capture(tmp_path / "c", TIMES)
-    manifest = json.loads((folder / "capture.json").read_text())
-    del manifest["frames"][5]
-    (folder / "capture.json").write_text(json.dumps(manifest))
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    edit_manifest(folder, frames=[*frames[:5], *frames[6:]])
     assert "was taken at 0.01 s, other patterns at 0.01, 0.16 s: every" in relit.refused("depth", folder, "--out", folder / "out")
 
 
 def test_floating_point_images_say_where_they_saturate(relit, tmp_path):
-    folder = capture(tmp_path / "c", TIMES, saturation=None)
-    manifest = json.loads((folder / "capture.json").read_text())
-    for number, (_, _, image) in enumerate(photographs(TIMES)):
-        write_exr(folder / f"{number:03d}.exr", np.repeat(image[..., None], 3, axis=2))
-        manifest["frames"][number]["image"] = f"{number:03d}.exr"
-    (folder / "capture.json").write_text(json.dumps(manifest))
+    folder = capture(tmp_path / "c", TIMES, "{:03d}.exr", saturation=None)
     assert "saturation: is missing: exposures of floating-point images" in relit.refused("depth", folder, "--out", folder / "out")
 
 

@@ -52,8 +52,7 @@ def test_images_of_an_earlier_run_go_and_other_files_stay(relit, tmp_path):
 
 
 def test_plan_is_a_table(relit):
-    outcome = relit("patterns", "--plan", "--projector", "640x480", "--fps", 30)
-    assert outcome.code == 0
+    outcome = relit.done("patterns", "--plan", "--projector", "640x480", "--fps", 30)
     point = next(line for line in outcome.out.splitlines() if line.startswith("point"))
     assert point.split()[1:4] == ["307200", "307200", "1.02e+04"]
     deep = relit("patterns", "--plan", "--projector", "640x480", "--baseline", 0.2, "--distance", 1, "--focal", 1000)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
-from service.depth.depth import depth
-from service.requests.depth import DepthRequest
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns
+from tests.scenes.depth import depth_of
 
 RIG = Rig(camera=(200, 150), camera_focal=230.0, projector=(256, 192), projector_focal=300.0)
 WORLD = World(shapes=(Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.1, 0.05, -1.2), 0.13, 0.8, texture=0.3),
@@ -33,8 +32,7 @@ def measured(folder, light, name, move):
     away = np.array([move(number / (len(patterns) - 1)) for number in range(len(patterns))])
     down = name.endswith("rows")
     write_capture(folder, WORLD, patterns, light=light, aside=[(size, 0.0) if down else (0.0, size) for size in away])
-    found = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", read_noise=WORLD.read_noise,
-                               photon_gain=1 / WORLD.electrons))
+    found = depth_of(folder, read_noise=WORLD.read_noise, photon_gain=1 / WORLD.electrons)
     solved = found.maps.mask & light.lit & np.isfinite(light.depth)
     assert solved.sum() > 0.4 * light.lit.sum()
     off = np.abs(found.maps.depth - light.depth)[solved] / found.maps.sigma[solved]

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.projected_scenes import Ball, Wall, World, trace, write_capture
-from service.depth.depth import depth
-from service.requests.depth import DepthRequest
 from stage.patterns.kary import kary_patterns, palette
 from tests.marks import first_short
+from tests.scenes.depth import depth_of
 
 SHAPES = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.05, -1.15), 0.12, 0.8))
 
@@ -20,7 +19,7 @@ def light():
 def solved(folder, world, light, patterns, declared=None):
     """What was found, and the error over σ of each solved pixel whose depth is known."""
     write_capture(folder / "capture", world, patterns, light=light, declared=declared)
-    found = depth(DepthRequest(capture=folder / "capture", out=folder / "out", device="cpu", photon_gain=1 / world.electrons))
+    found = depth_of(folder / "capture", photon_gain=1 / world.electrons)
     known = found.maps.mask & light.lit & np.isfinite(light.depth)
     return found, (np.abs(found.maps.depth - light.depth) / np.maximum(found.maps.sigma, 1e-9))[known]
 
@@ -28,7 +27,6 @@ def solved(folder, world, light, patterns, declared=None):
 @first_short(("base", "reflected", "blur_px", "digits"), [
     (8, False, 3.0, 1), (4, True, 3.0, 1), (3, False, 3.0, 2), (3, True, 0.4, 0), (4, False, 0.4, 0), (8, True, 0.4, 0)])
 def test_colours_that_are_not_resolved_are_left_out(tmp_path, light, base, reflected, blur_px, digits):
-    """4 to 19 % of what was solved was off by more than five σ, and of reflected codes little was solved."""
     found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light,
                         kary_patterns(320, "column", base=base, reflected=reflected, colors=palette(base)))
     assert (off > 5).mean() < 0.01 and len(off) > 0.9 * (light.lit & np.isfinite(light.depth)).sum()
@@ -58,9 +56,8 @@ def test_exchanged_red_and_blue_are_named(tmp_path, light, base, stripe_px):
 @first_short(("base", "reflected", "blur_px", "digits"), [
     (3, False, 1.5, 2), (3, True, 3.0, 2), (4, True, 6.0, 2), (5, False, 0.4, 1), (3, True, 0.4, 0), (4, True, 0.4, 0)])
 def test_digits_that_are_not_resolved_are_left_out(tmp_path, light, base, reflected, blur_px, digits):
-    """Stripes of 1 px, of which a camera pixel sees 1.6. A blurred digit was read as the middle one: of the reflected code under a blur of
-    3 px 27 % of the pixels were solved, and a quarter of these off by more than five σ. Both the share solved and that beyond five σ are
-    those of stripes that are resolved, with room for the rim of the ball."""
+    """Stripes of 1 px, of which a camera pixel sees 1.6. Both the share solved and that beyond five σ are those of stripes that are
+    resolved, with room for the rim of the ball."""
     patterns = kary_patterns(320, "column", base=base, reflected=reflected)
     found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light, patterns)
     assert (off > 5).mean() < 0.01 and len(off) > 0.9 * (light.lit & np.isfinite(light.depth)).sum()

@@ -1,7 +1,5 @@
 """A Gray code whose stripes are as wide as the period of the phase: what most scanners project."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_cap
 from kernels.status import Status
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import phase_patterns
-from stage.results.depth_maps import DepthMaps
+from tests.scenes.depth import depth_of
 
 SHAPES = (Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.4), Ball((0.12, -0.05, -1.2), 0.16, 0.8))
 RIGS = {axis: Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0, position_m=position)
@@ -19,23 +17,22 @@ WRONG_M = 0.05
 """A period is 8 to 15 cm of depth here, and a mixed pixel at the ball's outline 40 cm."""
 
 
-def solve(relit, folder, world, light, axis, stripe, *, inverses=True):
+def solve(folder, world, light, axis, stripe, *, inverses=True):
     patterns = (*phase_patterns(axis, (PERIOD,), 4),
                 *binary_patterns(world.rig.projector[axis == "row"], axis, stripe_px=stripe, inverses=inverses))
     write_capture(folder, world, patterns, light=light)
-    outcome = relit("depth", folder, "--out", folder / "out", "--device", "cpu")
-    assert outcome.code == 0, outcome.err
-    return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text())
+    return depth_of(folder)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("axis", "blur"), [("column", 2.0), ("row", 0.4)])
-def test_edges_number_the_periods(relit, tmp_path, axis, blur):
+def test_edges_number_the_periods(tmp_path, axis, blur):
     world = World(shapes=SHAPES, rig=RIGS[axis], blur_px=blur)
     light = trace(world)
-    fine, _ = solve(relit, tmp_path / "fine", world, light, axis, PERIOD // 2)
-    wide, report = solve(relit, tmp_path / "wide", world, light, axis, PERIOD)
-    assert "phase numbered by gray, edges refined" in json.dumps(report)
+    fine = solve(tmp_path / "fine", world, light, axis, PERIOD // 2).maps
+    found = solve(tmp_path / "wide", world, light, axis, PERIOD)
+    assert "phase numbered by gray, edges refined" in found.method
+    wide = found.maps
     assert wide.mask[light.lit].mean() > 0.9
     both = wide.mask & fine.mask
     other = both & (np.abs(wide.depth - fine.depth) > 1e-6)  # the same phase in another period
@@ -45,11 +42,11 @@ def test_edges_number_the_periods(relit, tmp_path, axis, blur):
 
 
 @pytest.mark.long
-def test_without_inverses_places_near_an_edge_stay_undecided(relit, tmp_path):
+def test_without_inverses_places_near_an_edge_stay_undecided(tmp_path):
     world = World(shapes=SHAPES, rig=RIGS["column"])
     light = trace(world)
-    fine, _ = solve(relit, tmp_path / "fine", world, light, "column", PERIOD // 2)
-    wide, _ = solve(relit, tmp_path / "wide", world, light, "column", PERIOD, inverses=False)
+    fine = solve(tmp_path / "fine", world, light, "column", PERIOD // 2).maps
+    wide = solve(tmp_path / "wide", world, light, "column", PERIOD, inverses=False).maps
     assert 0.7 < wide.mask[light.lit].mean() < 0.85  # three quarters of each period
     both = wide.mask & fine.mask
     assert np.allclose(wide.depth[both], fine.depth[both], atol=1e-6)

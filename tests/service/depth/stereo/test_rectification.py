@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.depth.stereo.rectification import rectify
 from stage.capture.camera import Camera, OtherCamera
@@ -12,12 +13,8 @@ from tests.scenes.stereo import CAMERA, OTHER, POSE
 
 
 def turned(axis, degrees, place):
-    angle = np.radians(degrees)
     pose = np.eye(4)
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    pose[i, i] = pose[j, j] = np.cos(angle)
-    pose[i, j], pose[j, i] = -np.sin(angle), np.sin(angle)
-    pose[:3, 3] = place
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix(), place
     return pose
 
 

@@ -42,8 +42,7 @@ def write(folder, left, right, *, seed=0, gain=1.0, swapped=False, **changes):
 
 
 def solve(relit, folder, *arguments):
-    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
-    assert outcome.code == 0, outcome.err
+    relit.done("depth", folder, "--out", folder / "out", *arguments)
     return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text())
 
 
@@ -124,8 +123,7 @@ WRONG = {
 @pytest.mark.long
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_calibration_is_named_and_sigma_holds_it(relit, tmp_path, wrong):
-    """Without it, all but a few in a hundred depths under the wrong yaw were off by more than five σ, without a word. The bounds: σ of one
-    error that all depths share holds it but for one in twenty such scenes."""
+    """The bounds: σ of one error that all depths share holds it but for one in twenty such scenes."""
     left, right, _ = seen("plane and sphere")
     folder = write(tmp_path, left.images, right.images)
     other, = json.loads((folder / "capture.json").read_text())["other_cameras"]
@@ -233,8 +231,7 @@ def test_what_is_declared_wrongly_is_named(relit, tmp_path, change, says):
 def test_images_without_texture_are_refused_with_a_sentence(relit, tmp_path):
     rng = np.random.default_rng(0)
     blank = [scenes.recorded(np.full((CAMERA.height, CAMERA.width), 0.2), rng) for _ in range(2)]
-    outcome = relit("depth", scenes.write_pair(tmp_path, blank[:1], blank[1:]), "--out", tmp_path / "out")
-    assert outcome.code == 2 and "show no texture that both see" in outcome.err
+    relit("depth", scenes.write_pair(tmp_path, blank[:1], blank[1:]), "--out", tmp_path / "out").refused("show no texture that both see")
 
 
 @pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.long), True])

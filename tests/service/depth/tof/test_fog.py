@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from service.depth.depth import depth
-from service.depth.tof.fog import find_fog
-from service.requests.depth import DepthRequest
+from service.depth.tof.shared_light import find_fog
 from tests.reference import tof
+from tests.scenes.depth import depth_of
 from tests.scenes.tof import far_camera, pulsed_frames, write
 
 ROWS, COLS, BINS, BIN_M, WIDTH_M = 24, 32, 60, 0.1, 0.09
@@ -38,7 +37,7 @@ def solved(folder, counts):
     """What relit depth makes of the counts."""
     frames = pulsed_frames(counts.reshape(ROWS, COLS, BINS), bin_s=2 * BIN_M / tof.LIGHT)
     write(folder, frames, camera=far_camera(ROWS, COLS))
-    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+    return depth_of(folder)
 
 
 @pytest.mark.long

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from service.depth.depth import depth
 from service.depth.tof.histograms import full_count
-from service.requests.depth import DepthRequest, TofOptions
 from tests.reference import tof
+from tests.scenes.depth import depth_of
 from tests.scenes.tof import far_camera, pulsed_frames, write
 
 ROWS, COLS = 24, 32
@@ -18,10 +17,9 @@ BIN_S = 1.5e-9
 BIN_M = tof.LIGHT * BIN_S / 2
 
 
-def solve(folder, counts, least_confidence=None, options=None, near_m=None, **declared):
+def solve(folder, counts, least_confidence=None, **declared):
     write(folder, pulsed_frames(counts.astype(np.float32), bin_s=BIN_S, **declared), camera=far_camera(*counts.shape[:2]))
-    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", least_confidence=least_confidence, near_m=near_m,
-                              tof=TofOptions.model_validate(options or {})))
+    return depth_of(folder, least_confidence=least_confidence)
 
 
 def ratios(result, view=VIEW):
@@ -183,7 +181,6 @@ def test_a_ceiling_is_found(ceiling):
 
 
 def test_a_bin_that_the_timer_fills_in_every_pixel_is_no_surface(tmp_path):
-    """It was the range of half of the pixels, sure of itself."""
     counts = tof.histogram(VIEW, 3000, background=0.5, seed=5)
     counts[..., 40] += np.random.default_rng(2).poisson(80, counts.shape[:2])
     result = solve(tmp_path, counts)

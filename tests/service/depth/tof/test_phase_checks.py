@@ -4,9 +4,8 @@ noise are those of tests/reference/tof.py."""
 import numpy as np
 import pytest
 
-from service.depth.depth import depth
-from service.requests.depth import DepthRequest
 from tests.reference import tof
+from tests.scenes.depth import depth_of
 from tests.scenes.tof import cw_frames, write
 
 ROWS, COLS = 72, 96
@@ -49,7 +48,7 @@ def textured(*, curved):
 def measured(folder, images, settings):
     """What relit depth makes of correlation images under these declarations."""
     write(folder, cw_frames(images, settings), camera={"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]})
-    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+    return depth_of(folder)
 
 
 def under(hz=HZ, phases=4, **more):
@@ -137,7 +136,7 @@ def test_surfaces_behind_the_span_are_named(tmp_path, hz, phases):
     found = measured(tmp_path, images, settings)
     assert not found.maps.mask.any() and "run on from" in found.warnings[0]
     if len(hz) > 1:
-        found = depth(DepthRequest(capture=tmp_path, out=tmp_path / "near", device="cpu", near_m=1.5))
+        found = depth_of(tmp_path, near_m=1.5)
         assert found.maps.mask.mean() > 0.9 and np.abs(found.maps.range - range_m)[found.maps.mask].max() < 0.1
 
 

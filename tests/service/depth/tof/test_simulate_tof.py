@@ -1,5 +1,7 @@
 """relit simulate: a depth to a capture, and back."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -21,12 +23,14 @@ def scene(folder):
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "options", "most_m"), [
     ("cw", ["--modulation-hz", "20e6,80e6", "--no-noise"], 1e-4), ("cw", ["--phases", "3", "--full-well", "1e6"], 0.03),
+    ("cw", ["--no-noise", "--source-m", "0.05,-0.02,0.01"], 1e-4), ("pulsed", ["--no-noise", "--source-m", "0.05,-0.02,0.01"], 4e-3),
     ("pulsed", ["--no-noise"], 2e-3), ("pulsed", ["--signal-photons", "40000", "--pulses", "20000"], 0.1),
 ])
 def test_what_is_simulated_is_solved_again(kind, options, most_m, tmp_path, relit):
     truth = scene(tmp_path)
-    outcome = relit("simulate", kind, tmp_path, "--out", tmp_path / "capture", *options)
-    assert outcome.code == 0 and "capture.json" in outcome.out, outcome.err
+    assert "capture.json" in relit.done("simulate", kind, tmp_path, "--out", tmp_path / "capture", *options).out
+    light = json.loads((tmp_path / "capture" / "capture.json").read_text())["frames"][0]["tof"]
+    assert light.get("source_m") == ([0.05, -0.02, 0.01] if "--source-m" in options else None)
     assert relit("depth", tmp_path / "capture", "--out", tmp_path / "out", "--device", "cpu").code == 0
     maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
     assert np.abs(maps.depth - truth.depth)[truth.mask].max() < most_m

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from service.depth.depth import depth
-from service.requests.depth import DepthRequest, TofOptions
+from service.requests.depth import TofOptions
 from stage.capture.camera import Camera
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
 from stage.stack.fingerprint import digest
 from stage.tof.calibration import Temperature, TofCalibration, fit_harmonics, write_calibration
 from tests.reference import tof
+from tests.scenes.depth import depth_of
 from tests.scenes.tof import CAMERA, cw_frames, pulsed_frames, write
 
 ROWS, COLS = 96, 128
@@ -21,8 +21,7 @@ VIEW = tof.room(ROWS, COLS)
 
 
 def run(folder, near_m=None, far_m=None, least_confidence=None, **options):
-    result = depth(DepthRequest(capture=folder, out=folder / "out", near_m=near_m, far_m=far_m, least_confidence=least_confidence,
-                                tof=TofOptions.model_validate(options), device="cpu"))
+    result = depth_of(folder, near_m=near_m, far_m=far_m, least_confidence=least_confidence, tof=TofOptions.model_validate(options))
     return result, DepthMaps.read(result.depth_path), json.loads(result.report_path.read_text())
 
 

@@ -10,13 +10,12 @@ from kernels.fusion.views import RangeImage, upload_views
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest
 from service.scans.fusion import boxes
-from service.scans.fusion.fuse import fuse
 from service.scans.fusion.fused_bricks import fused_bricks
 from service.scans.fusion.fused_surface import places_near
 from service.scans.fusion.range_images import PreparedScan, focal_of, prepare_scan
 from service.scans.points.ply_points import read_ply_points
-from service.scans.points.scan import Scan
 from stage.capture.camera import Camera, Distortion
+from tests.scenes.register import fuse_scans, scan_with
 from tests.scenes.statue import shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -31,7 +30,7 @@ def file(tmp_path_factory):
 
 
 def fused(file, out):
-    found = fuse(FuseRequest(scan_set=file, out=out, voxel_m=VOXEL, texture=False, close="none", device="cpu"))
+    found = fuse_scans(file, out, voxel_m=VOXEL, close="none")
     ply = read_ply_points(found.mesh_path)
     return found.facts, ply, ply.points[read_faces(found.mesh_path)].reshape(-1, 9)
 
@@ -137,9 +136,7 @@ def test_the_places_of_a_scan_hold_all_blocks_that_it_marks_whatever_its_noise(t
     camera = (Camera(projection="orthographic", resolution=(72, 96), pixel_size_m=0.015) if parallel else
               Camera(projection="perspective", resolution=(72, 96), focal_px=(130.0, 130.0)))
     cloud = camera.points(-shot.depth)[shot.mask]
-    scan = Scan(name="s", path=tmp_path, points=cloud.astype(np.float32), sigma=sigma[shot.mask].astype(np.float32),
-                sigma_source="measured", normals=None, colours=None, confidence=None, origin=np.zeros(3),
-                camera=camera, pixels=np.flatnonzero(shot.mask), pose=pose, pose_covariance=None, maps=None)
+    scan = scan_with(cloud.astype(np.float32), sigma[shot.mask], camera=camera, pixels=np.flatnonzero(shot.mask), pose=pose)
     prepared = prepare_scan(scan, tmp_path)
     origin, voxel = np.array([0.011, -0.02, 0.007]), VOXEL
     near = {tuple(place) for place in places_near(prepared, origin, voxel)}

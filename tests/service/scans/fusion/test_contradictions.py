@@ -5,6 +5,7 @@ import pytest
 
 from service.scans.fusion.bands import Bands
 from service.scans.fusion.joined_normals import compared, join_normals, unlike_noise
+from tests.service.scans.mesh_files import lattice_faces
 
 PIXEL = 2e-3
 COUNT = 90
@@ -15,9 +16,7 @@ def sheet(height):
     """Vertices of a lattice with a spacing of half a pixel, and its faces."""
     u, v = (axis.ravel() * PIXEL / 2 for axis in np.meshgrid(np.arange(COUNT), np.arange(COUNT)))
     points = np.stack([u, v, height(u, v)], axis=1)
-    corner = np.arange(COUNT * COUNT).reshape(COUNT, COUNT)
-    a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, :-1].ravel(), corner[1:, 1:].ravel()
-    return points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    return points, lattice_faces(COUNT, COUNT)
 
 
 MIDDLE = COUNT * PIXEL / 4

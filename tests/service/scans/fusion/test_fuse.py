@@ -8,13 +8,13 @@ import pytest
 
 from service.errors import AssetError, RequestError
 from service.requests.register import FuseRequest
-from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from stage.results.depth_normals import depth_normals
 from stage.results.maps import SurfaceMaps
 from tests.scenes.in_front import gradient, unit
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import SIGMA, colour_of, distance, shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -35,7 +35,7 @@ def shots():
 def fused(tmp_path_factory, shots):
     folder = tmp_path_factory.mktemp("statue")
     file = write_scans(folder, shots, coloured=True)
-    return fuse(FuseRequest(scan_set=file, out=folder / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    return fuse_scans(file, folder / "out", voxel_m=VOXEL)
 
 
 @pytest.mark.long
@@ -78,7 +78,7 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots]
     poses[4][:3, 3] += OFF * poses[4][:3, 0]
     file = write_scans(tmp_path, shots, poses=poses)
-    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    result = fuse_scans(file, tmp_path / "out", voxel_m=VOXEL)
     about = [warning for warning in result.warnings if "its pose is wrong" in warning]
     assert len(about) == 1 and about[0].startswith("scan view 4: lies ") and "left out" in about[0]
     assert [scan["name"] for scan in result.facts["scans"] if not scan["fused"]] == ["view 4"]
@@ -90,11 +90,11 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
 def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     """The mesh is to the last byte that of the set without the second one, its σ with it."""
     file = write_scans(tmp_path / "once", shots[:3])
-    once = fuse(FuseRequest(scan_set=file, out=tmp_path / "once" / "out", voxel_m=2 * VOXEL, texture=False, device="cpu"))
+    once = fuse_scans(file, tmp_path / "once" / "out", voxel_m=2 * VOXEL)
     listed = json.loads(file.read_text())
     listed["scans"].append({**listed["scans"][1], "name": "again"})
     file.write_text(json.dumps(listed))
-    twice = fuse(FuseRequest(scan_set=file, out=tmp_path / "twice", voxel_m=2 * VOXEL, texture=False, device="cpu"))
+    twice = fuse_scans(file, tmp_path / "twice", voxel_m=2 * VOXEL)
     assert [w for w in twice.warnings if w not in once.warnings] == [
         "scan again: holds no points but those of view 1, and counts once"]
     assert twice.mesh_path.read_bytes() == once.mesh_path.read_bytes()
@@ -105,7 +105,7 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots[:3]]
     poses[2][0, 3] += 3.0
     file = write_scans(tmp_path, shots[:3], poses=poses)
-    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    result = fuse_scans(file, tmp_path / "out", voxel_m=VOXEL)
     (warning,) = (warning for warning in result.warnings if "in common" in warning)
     assert warning.startswith("scan view 2: ")
 
@@ -113,8 +113,7 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
 @pytest.mark.long
 def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
     file = write_scans(tmp_path, shots[::5], coloured=True)
-    measured, closed = (fuse(FuseRequest(scan_set=file, out=tmp_path / close, voxel_m=2 * VOXEL, texture=False, device="cpu", close=close))
-                        for close in ("none", "all"))
+    measured, closed = (fuse_scans(file, tmp_path / close, voxel_m=2 * VOXEL, close=close) for close in ("none", "all"))
     assert closed.facts["watertight"] and closed.facts["holes"]["count"] > 5
     before, after, faces = read_ply_points(measured.mesh_path), read_ply_points(closed.mesh_path), read_faces(closed.mesh_path)
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
@@ -130,25 +129,25 @@ def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
 
 @pytest.mark.long
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
-    def refused(words, **changes):
+    def refused(words, scan_set, **changes):
         with pytest.raises((RequestError, AssetError), match=words):
-            fuse(FuseRequest(out=tmp_path / "out", device="cpu", **{"texture": False, **changes}))
+            fuse_scans(scan_set, tmp_path / "out", **changes)
 
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    refused(r"xatlas: pip install 'relit\[scans\]', or give --no-texture", scan_set=write_scans(tmp_path, shots[:1]), texture=True)
+    refused(r"xatlas: pip install 'relit\[scans\]', or give --no-texture", write_scans(tmp_path, shots[:1]), texture=True)
     file = write_scans(tmp_path, shots[:2], poses=[shots[0].world_from_camera, None])
-    refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit", scan_set=file)
+    refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit", file)
     pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]
     refused("the poses contradict each other: run relit register first",
-            scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
+            write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
     around = shots[::6]
     inverted = write_scans(tmp_path, around, poses=[np.linalg.inv(shot.world_from_camera) for shot in around])
     on_map = write_scans(tmp_path / "map", shots[:2], poses=[shot.world_from_camera + ON_MAP for shot in shots[:2]])
-    refused("scans lie 5.2e[+]06 m from the origin, where the floats of a mesh hold places to 0.5 m only: subtract one", scan_set=on_map)
-    refused("the poses are world_to_scan: read so, .* and 0 and 0 as they are: write them as scan_to_world", scan_set=inverted)
+    refused("scans lie 5.2e[+]06 m from the origin, where the floats of a mesh hold places to 0.5 m only: subtract one", on_map)
+    refused("the poses are world_to_scan: read so, .* and 0 and 0 as they are: write them as scan_to_world", inverted)
     apart = [shot.world_from_camera + 9 * number * np.outer(np.eye(4)[0], np.eye(4)[3]) for number, shot in enumerate(around)]
     refused(f"no two of the {len(around)} scans have a surface in common: look whether lengths are in metres",
-            scan_set=write_scans(tmp_path, around, poses=apart))
+            write_scans(tmp_path, around, poses=apart))
     assert not (tmp_path / "out").exists()
 
 
@@ -169,7 +168,7 @@ def test_range_images_of_orthographic_cameras_are_fused(tmp_path, shots, mixed):
         if not mixed or number % 3:
             DepthMaps(camera=camera, mask=shot.mask, depth=shot.depth.astype(np.float32),
                       sigma=np.full(shot.side, SIGMA, dtype=np.float32)).write(tmp_path / f"scan{number}" / "depth.exr")
-    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    result = fuse_scans(file, tmp_path / "out", voxel_m=VOXEL)
     error = distance(read_ply_points(result.mesh_path).points)
     assert np.median(np.abs(error)) <= 0.2e-3 and abs(np.median(error)) < 0.1e-3  # half as many views as above
     assert np.percentile(np.abs(error), 90) < 2 * SIGMA + 1e-3
@@ -196,8 +195,8 @@ def test_joined_maps_replace_the_depth_by_a_better_one(tmp_path):
         depth = np.where(shot.mask, shot.depth, 1).astype(np.float32)
         maps.append(SurfaceMaps(camera=camera, mask=shot.mask, normal=depth_normals(depth, shot.mask, camera, radius=2), height=-depth,
                                 height_sigma=np.full(shot.side, joined, dtype=np.float32)))
-    found = [fuse(FuseRequest(scan_set=write_scans(tmp_path / name, shots, sigma=noise, maps=given), out=tmp_path / name / "out",
-                              voxel_m=VOXEL, texture=False, device="cpu")) for name, given in (("depth", None), ("joined", maps))]
+    found = [fuse_scans(write_scans(tmp_path / name, shots, sigma=noise, maps=given), tmp_path / name / "out", voxel_m=VOXEL)
+             for name, given in (("depth", None), ("joined", maps))]
     error = [np.median(np.abs(distance(read_ply_points(result.mesh_path).points))) for result in found]
     assert error[1] < 0.4 * error[0]  # pixels of 7.5 mm see chords, which no noise explains
     assert found[1].facts["sigma_m"]["median"] < 0.7 * found[0].facts["sigma_m"]["median"]

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.register import FuseRequest
-from service.scans.fusion.fuse import FuseResult, fuse
+from service.scans.fusion.fuse import FuseResult
 from service.scans.points.ply_points import read_ply_points
 from stage.results.maps import SurfaceMaps
 from tests.kernels.scenes import angle_degrees
 from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit, with_dead_pixels
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import Shot, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -25,9 +25,18 @@ NOISE = [(name, DEPTH_SIGMA if name == "plates" else 3 * DEPTH_SIGMA) for name i
 
 def both(folder, shots: list[Shot], maps: list[SurfaceMaps], sigma: float = DEPTH_SIGMA) -> tuple[FuseResult, FuseResult]:
     """The surface of the depth alone, and joined with the normals; the second takes the bricks of the first."""
-    file = write_scans(folder, shots, sigma=sigma, maps=maps)
-    request = FuseRequest(scan_set=file, out=folder / "depth", voxel_m=VOXEL, texture=False, device="cpu", cache=folder / "cache")
-    return fuse(request), fuse(request.model_copy(update={"out": folder / "joined", "join_normals": True}))
+    file, options = write_scans(folder, shots, sigma=sigma, maps=maps), {"voxel_m": VOXEL, "cache": folder / "cache"}
+    return fuse_scans(file, folder / "depth", **options), fuse_scans(file, folder / "joined", join_normals=True, **options)
+
+
+def disc(flipped):
+    """Shots of the disc and their maps, of which x of the normals is turned over in some pixels."""
+    scene = SCENES["disc"]
+    shots = fan(scene, count=5, side=(80, 80), sigma=DEPTH_SIGMA)
+    maps = [photometric(scene, shot, seed=number, noise_degrees=NORMAL_DEGREES, drift_degrees=0.0) for number, shot in enumerate(shots)]
+    for each in maps:
+        each.normal[flipped][..., 0] *= -1
+    return shots, maps
 
 
 def rms(values: np.ndarray) -> float:
@@ -68,13 +77,8 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
 
 @pytest.mark.long
 def test_normals_of_another_surface_are_refused(tmp_path):
-    scene = SCENES["disc"]
-    shots = fan(scene, count=5, side=(80, 80), sigma=DEPTH_SIGMA)
-    maps = [photometric(scene, shot, seed=number, noise_degrees=NORMAL_DEGREES, drift_degrees=0.0) for number, shot in enumerate(shots)]
-    for each in maps:
-        each.normal[..., 0] *= -1
     with pytest.raises(RequestError, match=r"scan-set\.json: the photometric normals contradict the depth"):
-        both(tmp_path, shots, maps)
+        both(tmp_path, *disc(np.s_[:]))
     assert not (tmp_path / "joined").exists()
 
 
@@ -82,10 +86,6 @@ def test_normals_of_another_surface_are_refused(tmp_path):
 def test_normals_that_contradict_a_third_of_the_depth_are_told(tmp_path):
     """Normals are flipped in the left part of every view: what they show stays as its depth has it."""
     scene = SCENES["disc"]
-    shots = fan(scene, count=5, side=(80, 80), sigma=DEPTH_SIGMA)
-    maps = [photometric(scene, shot, seed=number, noise_degrees=NORMAL_DEGREES, drift_degrees=0.0) for number, shot in enumerate(shots)]
-    for each in maps:
-        each.normal[:, :32, 0] *= -1
-    alone, joined = both(tmp_path, shots, maps)
+    alone, joined = both(tmp_path, *disc(np.s_[:, :32]))
     assert rms(scene(read_ply_points(joined.mesh_path).points)) < 1.1 * rms(scene(read_ply_points(alone.mesh_path).points))
     assert len([warning for warning in joined.warnings if warning.startswith("normals: at ") and "contradict the depth" in warning]) == 1

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.register import FuseRequest
-from service.scans.fusion.fuse import FuseResult, fuse
+from service.scans.fusion.fuse import FuseResult
 from service.scans.points.ply_points import read_ply_points
 from tests.scenes.in_front import gradient, photometric, unit
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import Shot, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -71,9 +71,8 @@ def test_the_joined_surface_has_the_place_of_the_depth_and_the_normals_of_the_ph
     """Normals that do not drift: tests/service/scans/fusion/test_joined_normals.py."""
     file = write_scans(tmp_path, shots(), sigma=DEPTH_SIGMA, maps=[
         photometric(field, shot, seed=number, noise_degrees=0.5, drift_degrees=3.0) for number, shot in enumerate(shots())])
-    request = FuseRequest(scan_set=file, out=tmp_path / "apart", voxel_m=VOXEL, texture=False, device="cpu")
-    apart = fuse(request)
-    joined = fuse(request.model_copy(update={"out": tmp_path / "joined", "join_normals": True}))
+    apart = fuse_scans(file, tmp_path / "apart", voxel_m=VOXEL)
+    joined = fuse_scans(file, tmp_path / "joined", voxel_m=VOXEL, join_normals=True)
     before, after = errors(apart), errors(joined)
     assert after.place_m < 0.4 * before.place_m  # no worse than the depth alone is the reach of the issue
     assert after.faces < np.hypot(1.1 * before.normals, after.chords) < 0.5 * before.faces
@@ -84,5 +83,5 @@ def test_the_joined_surface_has_the_place_of_the_depth_and_the_normals_of_the_ph
 def test_scans_without_maps_are_refused(tmp_path):
     file = write_scans(tmp_path, shots()[:1], sigma=DEPTH_SIGMA)
     with pytest.raises(RequestError, match=r"--join-normals: no scan of .* has photometric normals"):
-        fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, join_normals=True, device="cpu"))
+        fuse_scans(file, tmp_path / "out", voxel_m=VOXEL, join_normals=True)
     assert not (tmp_path / "out").exists()

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from service.scans.fusion.holes import area_vectors
 from service.scans.fusion.joined_normals import join_normals
+from tests.service.scans.mesh_files import lattice_faces
 
 PIXEL, COUNT, SIGMA = 2e-3, 60, 1e-3
 WAVE, DEEP = 90.0, 6e-4
@@ -18,11 +20,6 @@ def normals_at(points):
     slope = np.stack([-WAVE * DEEP * np.cos(WAVE * u) * np.cos(WAVE * v + 1), WAVE * DEEP * np.sin(WAVE * u) * np.sin(WAVE * v + 1),
                       np.ones(len(points))], axis=1)
     return slope / np.linalg.norm(slope, axis=1, keepdims=True)
-
-
-def area_vectors(points, faces):
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
 
 
 def degrees(points, faces):
@@ -47,9 +44,7 @@ def sheet(thin):
     fx, fy = x - left, y - low
     noise = (drawn[low, left] * (1 - fx) * (1 - fy) + drawn[low, left + 1] * fx * (1 - fy)
              + drawn[low + 1, left] * (1 - fx) * fy + drawn[low + 1, left + 1] * fx * fy)
-    corner = np.arange(COUNT * COUNT).reshape(COUNT, COUNT)
-    a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, :-1].ravel(), corner[1:, 1:].ravel()
-    return np.stack([u, v, height(u, v) + noise], axis=1), np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    return np.stack([u, v, height(u, v) + noise], axis=1), lattice_faces(COUNT, COUNT)
 
 
 def seen(points, seed=1):

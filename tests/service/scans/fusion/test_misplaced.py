@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.errors import RequestError
-from service.requests.register import FuseRequest, Misplaced
-from service.scans.fusion.fuse import fuse
+from service.requests.register import Misplaced
 from service.scans.fusion.misplaced import Readings, Sample, place_scans
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import place, shoot, turntable, write_scans
 
 VOXEL, SIGMA = 0.025, 0.5e-3
@@ -95,10 +95,9 @@ def test_two_pairs_that_contradict_each_other_are_not_told_apart():
 def test_scans_of_another_scale_than_their_poses_are_named_so(tmp_path):
     """Every scan grows about its own scanner, and seems misplaced."""
     shots = [shot._replace(depth=1.01 * shot.depth) for shot in turntable(6, (192, 144), range_m=2.0)]
-    request = FuseRequest(scan_set=write_scans(tmp_path, shots), out=tmp_path / "out", texture=False, device="cpu")
     # the factor by which depths were multiplied: at the fourth digit the fit is off, as it moves no point to another pixel
     with pytest.raises(RequestError, match=r"all fit if their coordinates are multiplied by 0\.990\d, .* by 1\.0\d+: the unit"):
-        fuse(request)
+        fuse_scans(write_scans(tmp_path, shots), tmp_path / "out")
 
 
 def arc(folder, poses=None):
@@ -112,11 +111,10 @@ def arc(folder, poses=None):
 def test_inverted_poses_are_named_so(tmp_path, moved_m):
     """About a round body most of the surface fits all the same; with the world beside it nothing does."""
     file = arc(tmp_path, lambda pose: np.linalg.inv(pose + moved_m * np.outer(np.eye(4)[0], np.eye(4)[3])))
-    request = FuseRequest(scan_set=file, out=tmp_path / "out", texture=False, device="cpu")
     with pytest.raises(RequestError, match=r"scans\[\]\.scan_to_world: the poses are world_to_scan: .* write them as scan_to_world"):
-        fuse(request)
-    assert not request.out.exists()
-    kept = fuse(request.model_copy(update={"misplaced": Misplaced.KEEP}))
+        fuse_scans(file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    kept = fuse_scans(file, tmp_path / "out", misplaced=Misplaced.KEEP)
     assert sum("the poses are world_to_scan" in warning for warning in kept.warnings) == 1
 
 
@@ -126,10 +124,8 @@ def test_inverted_poses_are_named_so(tmp_path, moved_m):
 def test_poses_of_imported_frames_that_mean_something_else_are_named(tmp_path, written, words):
     """Files of depth cameras have poses in the axes of OpenCV, y down and z forwards."""
     axes = np.diag([1.0, -1, -1, 1])
-    request = FuseRequest(scan_set=arc(tmp_path, lambda pose: written(pose @ axes) @ axes), out=tmp_path / "out", texture=False,
-                          device="cpu")
     with pytest.raises(RequestError, match=words):
-        fuse(request)
+        fuse_scans(arc(tmp_path, lambda pose: written(pose @ axes) @ axes), tmp_path / "out")
 
 
 def with_quaternion(pose, quaternion):
@@ -140,5 +136,5 @@ def with_quaternion(pose, quaternion):
 
 
 def test_right_poses_are_not_inverted_ones(tmp_path):
-    found = fuse(FuseRequest(scan_set=arc(tmp_path, lambda pose: pose), out=tmp_path / "out", texture=False, device="cpu"))
+    found = fuse_scans(arc(tmp_path, lambda pose: pose), tmp_path / "out")
     assert all(scan["fused"] for scan in found.facts["scans"]) and not any("world_to_scan" in warning for warning in found.warnings)

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.errors import RequestError
-from service.requests.register import FuseRequest, RegisterRequest
-from service.scans.fusion.fuse import fuse
+from service.requests.register import RegisterRequest
 from service.scans.fusion.prepared_scans import as_range_image
 from service.scans.points.planes import local_planes
 from service.scans.points.ply_points import read_ply_points
@@ -17,6 +17,7 @@ from stage.errors import ManifestError
 from stage.formats.ply import PointCloud, write_ply
 from stage.sets.scan_set import read_scan_set
 from tests.scenes.clouds import MM, Cloud, all_around, entry, scatter
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import SIGMA, colour_of, distance, place, turntable, write_scans, write_set
 
 VOXEL = 4e-3
@@ -30,7 +31,7 @@ def clouds() -> list[Cloud]:
 
 
 def fused(file, **changes):
-    return fuse(FuseRequest(scan_set=file, out=file.parent / "out", voxel_m=VOXEL, texture=False, device="cpu", **changes))
+    return fuse_scans(file, file.parent / "out", voxel_m=VOXEL, **changes)
 
 
 def errors(result) -> np.ndarray:
@@ -124,7 +125,7 @@ def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
     refused("points lie before or behind others as seen from viewpoint_m",
             entry(all_sides, tmp_path, 0))
     near = np.linalg.norm(one.points - one.points[0], axis=1) < 0.06
-    apart = np.vstack([one.points[near], one.viewpoint + (one.points[:5] - one.viewpoint) @ _turned(0.8)])
+    apart = np.vstack([one.points[near], one.viewpoint + (one.points[:5] - one.viewpoint) @ Rotation.from_euler("x", 0.8).as_matrix()])
     refused(r"are spread over \d+ x \d+ pixels as seen from viewpoint_m",
             entry(one._replace(points=apart, colours=one.colours[:len(apart)]), tmp_path, 0))
     for points in (one.points[:1].repeat(500, axis=0), one.points[0] + np.linspace(0, 0.3, 500)[:, None] * [1, 0, 0]):
@@ -163,8 +164,3 @@ def _in_one_file(clouds: list[Cloud]) -> Cloud:
     parts = [(cloud.points @ cloud.world_from_file[:3, :3].T + cloud.world_from_file[:3, 3]) @ first[:3, :3].T + first[:3, 3]
              for cloud in clouds]
     return clouds[0]._replace(points=np.vstack(parts), colours=np.vstack([cloud.colours for cloud in clouds]))
-
-
-def _turned(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.register import FuseRequest
 from service.scans.fusion import range_images
-from service.scans.fusion.fuse import FuseResult, fuse
+from service.scans.fusion.fuse import FuseResult
 from service.scans.fusion.range_images import prepare_scan
 from service.scans.points.ply_points import read_ply_points
 from service.scans.read import read_scan
 from stage.sets.scan_set import read_scan_set
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
 STATUS = Path("/proc/self/status")
@@ -51,7 +51,7 @@ def both(tmp_path_factory) -> list[FuseResult]:
     with pytest.MonkeyPatch.context() as patch:
         for least in (range_images.LEAST_SQUARES, 1000):
             patch.setattr(range_images, "LEAST_SQUARES", least)
-            found.append(fuse(FuseRequest(scan_set=file, out=folder / str(least), voxel_m=VOXEL, texture=False, device="cpu")))
+            found.append(fuse_scans(file, folder / str(least), voxel_m=VOXEL))
     return found
 
 

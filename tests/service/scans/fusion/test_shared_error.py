@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from service.requests.register import FuseRequest, Misplaced
-from service.scans.fusion.fuse import fuse
+from service.requests.register import Misplaced
 from service.scans.fusion.misplaced import Readings, Sample
 from service.scans.fusion.shared_error import shared_sigma
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import turntable, write_scans
 
 PIXEL_M, SIGMA_M = 1e-3, 2e-4
@@ -61,7 +61,7 @@ def test_points_as_dense_as_pixels_tell_too():
 
 def test_what_is_not_known_is_null_and_said(tmp_path):
     """Two sides of a statue that are opposite have nothing in common."""
-    result = fuse(FuseRequest(scan_set=write_scans(tmp_path, turntable(2, (48, 64), range_m=2.0)), out=tmp_path / "out", texture=False,
-                              misplaced=Misplaced.KEEP, device="cpu"))
+    file = write_scans(tmp_path, turntable(2, (48, 64), range_m=2.0))
+    result = fuse_scans(file, tmp_path / "out", misplaced=Misplaced.KEEP)
     assert result.facts["shared_sigma_m"] is None
     assert any("too little in common to tell what each errs as a whole" in warning for warning in result.warnings)

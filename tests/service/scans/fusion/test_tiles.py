@@ -9,6 +9,7 @@ from service.requests.register import FuseRequest
 from service.scans.fusion import fused_bricks
 from service.scans.fusion.fuse import FuseResult, fuse
 from service.scans.points.ply_points import read_ply_points
+from tests.scenes.register import fuse_scans
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -22,10 +23,8 @@ VOXEL = 3e-3
 def both(tmp_path_factory) -> tuple[FuseResult, FuseResult]:
     folder = tmp_path_factory.mktemp("tiles")
     file = write_scans(folder, turntable(5, (128, 96)), coloured=True)
-    made = [fuse(FuseRequest(scan_set=file, out=folder / str(tiles), voxel_m=VOXEL, texture=False, tiles=tiles, close="none",
-                             device="cpu"))
-            for tiles in (False, True)]
-    return made[0], made[1]
+    whole, tiled = (fuse_scans(file, folder / str(tiles), voxel_m=VOXEL, tiles=tiles, close="none") for tiles in (False, True))
+    return whole, tiled
 
 
 def vertices(path) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Coded markers and chessboards in images of range images: where they are, how sure, and a wall that only they place."""
 
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from service.scans.points.scan import Scan, Target
 from service.scans.registration.found_targets import board_in, markers_in, placed
 from service.scans.registration.target_pairs import pose_by_targets
 from stage.capture.camera import Camera
+from tests.scenes.register import scan_with
 from tests.scenes.statue import place
 
 SIGMA = 2e-4
@@ -73,10 +74,7 @@ def look(kind: str, pose: np.ndarray, *, seed: int, upside_down: bool = False) -
     pixels = np.flatnonzero(total > 0.3)
     points = CAMERA.points(-depth).reshape(-1, 3)[pixels]
     stretch = np.linalg.norm(points, axis=1) / -points[:, 2]
-    scan = Scan(name="wall", path=Path("wall"), points=points, sigma=(SIGMA * stretch).astype(np.float32), sigma_source="measured",
-                normals=None, colours=None, confidence=None, origin=np.zeros(3), camera=CAMERA, pixels=pixels,
-                pose=None, pose_covariance=None, maps=None)
-    return image.astype(np.float32), scan
+    return image.astype(np.float32), scan_with(points, SIGMA * stretch, camera=CAMERA, pixels=pixels)
 
 
 def met(pose: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,5 +118,5 @@ def test_marks_without_depths_and_markers_that_are_there_twice_are_left_out():
     assert len(markers_in(image, "aruco4")) == 20
     assert not markers_in(np.concatenate([image, image], axis=1), "aruco4")
     far = scan.points[:, 0] > 0.05
-    part = Scan(**{**scan.__dict__, "points": scan.points[far], "sigma": scan.sigma[far], "pixels": scan.pixels[far]})
+    part = replace(scan, points=scan.points[far], sigma=scan.sigma[far], pixels=scan.pixels[far])
     assert 0 < len(placed(markers_in(image, "aruco4"), part)) < 20

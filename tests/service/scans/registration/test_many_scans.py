@@ -9,9 +9,9 @@ from service.scans.points import cloud
 from service.scans.points.rigid import inverse, moved, step_between
 from service.scans.registration import candidates, free_space, registration
 from service.scans.registration.candidates import Outline, Overlaps, overlapping
-from service.scans.registration.registration import Registration, RegistrationOptions, register
+from service.scans.registration.registration import Registration
+from tests.scenes.register import off, register, scan_of, seen
 from tests.scenes.turntable import MM, View, figure
-from tests.service.scans.registration.test_registration import off, scan_of, seen
 
 FEW = 3
 """Scans up to which all pairs are tried here."""
@@ -42,7 +42,7 @@ def test_a_part_of_all_pairs_is_enough(known, monkeypatch):
     """Pixels of 10 mm; the bend between them leaves more than the noise of 0.25 mm."""
     bounded(monkeypatch, 3)
     views = seen(figure, *range(0, 360, 40))
-    found = register([scan_of(view) for view in views], rough(views) if known else [None] * len(views), RegistrationOptions(threads=2))
+    found = register([scan_of(view) for view in views], rough(views) if known else None)
     assert len(found.poses) == len(views) and len(found.pairs) < len(views) * (len(views) - 1) // 2
     shift, turn = worst(views, found)
     assert shift < 0.2 * MM and turn < 0.05
@@ -53,7 +53,7 @@ def test_scans_are_thinned_to_a_bound(monkeypatch):
     monkeypatch.setattr(cloud, "MOST_POINTS", 1500)
     monkeypatch.setattr(free_space, "MOST_PIXELS", 1000)
     views = seen(figure, 0, 40)
-    found = register([scan_of(view) for view in views], rough(views), RegistrationOptions())
+    found = register([scan_of(view) for view in views], rough(views))
     shift, turn = worst(views, found)
     assert shift < 1 * MM and turn < 0.2
 
@@ -69,7 +69,7 @@ def test_a_part_seen_from_near_is_joined_to_the_whole_where_it_has_a_start():
     part = replace(scan, points=scan.points[there], sigma=scan.sigma[there], name="arm")
     scans = [*(scan_of(view) for view in views), part]
     every = [*views, close]
-    found = register(scans, rough(every), RegistrationOptions(threads=2))
+    found = register(scans, rough(every))
     assert set(found.poses) == {0, 1, 2, 3}
     step = step_between(inverse(found.poses[0] @ inverse(views[0].world_from_scan)) @ found.poses[3] @ inverse(close.world_from_scan),
                         MIDDLE)

@@ -2,21 +2,20 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from service.scans.points.rigid import inverse, moved, step_between
-from service.scans.points.scan import Scan
 from service.scans.registration.extent import CELLS_ACROSS, extent_of
 from service.scans.registration.look_alikes import looks_alike_turned
 from service.scans.registration.pairs import PairState, prepare
-from service.scans.registration.registration import NoneJoinedError, Registration, RegistrationOptions, register
+from service.scans.registration.registration import NoneJoinedError, Registration
 from stage.capture.camera import Camera
 from stage.errors import ScanError
 from tests.scenes import statue
-from tests.scenes.turntable import MM, Distance, View, ball, box, capsule, figure, pillar, pose, see, urn, vase
+from tests.scenes.register import off, register, scan_of, seen
+from tests.scenes.turntable import MM, View, ball, box, capsule, figure, pillar, urn, vase
 
 SIGMA = 0.25 * MM
 SYMMETRIC = {"vase": vase, "pillar": pillar, "ball": partial(ball, centre=(0, 0, 0), radius=0.3),
@@ -28,29 +27,8 @@ def jug(p: np.ndarray) -> np.ndarray:
     return np.minimum(vase(p), capsule(p, (0.2, 0.2, 0), (0.3, -0.1, 0.02), 0.03))
 
 
-def scan_of(view: View, *, points_only: bool = False) -> Scan:
-    camera, pixels = view.camera, np.flatnonzero(view.mask)
-    x, y = camera.plane_coordinates()
-    sigma = view.sigma.reshape(-1)[pixels] * np.sqrt(1 + x**2 + y**2).reshape(-1)[pixels]
-    return Scan(name=f"at {view.world_from_scan[0, 0]:.3f}", path=Path("scan"), points=camera.points(-view.depth).reshape(-1, 3)[pixels],
-                sigma=sigma.astype(np.float32), sigma_source="measured", normals=None,
-                colours=None, confidence=None, origin=np.zeros(3), camera=None if points_only else camera,
-                pixels=None if points_only else pixels, pose=None, pose_covariance=None, maps=None)
-
-
-def seen(surface: Distance, *angles: float, rows: int = 120, sigma: float = SIGMA, trial: int = 0) -> list[View]:
-    return [see(surface, pose(angle), rows=rows, sigma=sigma, seed=1000 * trial + k) for k, angle in enumerate(angles)]
-
-
 def registered(views: list[View], starts: list[np.ndarray | None] | None = None, **options) -> Registration:
-    return register([scan_of(view, **options) for view in views], starts or [None] * len(views), RegistrationOptions(threads=2))
-
-
-def off(views: list[View], found: Registration) -> np.ndarray:
-    """[scan, 6] motion from the true to the found pose of each scan, about the middle of the figure, against the reference."""
-    world = found.poses[found.reference] @ inverse(views[found.reference].world_from_scan)
-    return np.array([step_between(inverse(world) @ placed @ inverse(views[number].world_from_scan), np.zeros(3))
-                     for number, placed in found.poses.items()])
+    return register([scan_of(view, **options) for view in views], starts)
 
 
 @pytest.mark.long
@@ -106,7 +84,7 @@ def test_few_noisy_points_with_little_in_common_come_together():
     scans = [scan_of(view, points_only=True) for view in views]
     drawn = [np.random.default_rng(number).permutation(len(scan.points))[:1200] for number, scan in enumerate(scans)]
     few = [replace(scan, points=scan.points[kept], sigma=scan.sigma[kept]) for scan, kept in zip(scans, drawn, strict=True)]
-    wrong = off(views, register(few, [None, None], RegistrationOptions()))[1]
+    wrong = off(views, register(few))[1]
     assert np.linalg.norm(wrong[3:]) < 6 * MM / 3 * 3**0.5 and np.degrees(np.linalg.norm(wrong[:3])) < 1
 
 
@@ -205,7 +183,7 @@ def test_outliers_do_not_move_poses():
         scan, rng = scan_of(view), np.random.default_rng(number)
         wild = np.where(rng.random(len(scan.points)) < 0.05, 1 + 0.05 * rng.standard_normal(len(scan.points)), 1)
         scans.append(replace(scan, points=(scan.points * wild[:, None]).astype(np.float32)))
-    found = register(scans, [None, None], RegistrationOptions())
+    found = register(scans)
     assert np.linalg.norm(off(views, found)[1][3:]) < 0.2 * MM
     assert found.pairs[0].state is PairState.JOINED
 
@@ -226,7 +204,7 @@ def test_a_body_is_not_joined_to_its_turned_self():
     views = seen(urn, 0, 90, rows=100)
     with pytest.raises(ScanError, match="fits as well when it is turned by"):
         registered(views)
-    found = register([scan_of(view) for view in views], [None, None], RegistrationOptions(accept_alike=True))
+    found = register([scan_of(view) for view in views], accept_alike=True)
     wrong = off(views, found)[1]
     assert found.alike_turned == (0, 1) and found.pairs[0].reason
     assert np.linalg.norm(wrong[:3]) < 2 * np.sqrt(np.trace(found.covariances[1][:3, :3]))
@@ -249,4 +227,4 @@ def test_what_a_start_places_is_not_named():
     views = seen(urn, 0, 20, rows=80)
     scans = [scan_of(view) for view in views]
     starts = [view.world_from_scan for view in views]
-    assert register(scans, starts, RegistrationOptions()).alike_turned == ()
+    assert register(scans, starts).alike_turned == ()

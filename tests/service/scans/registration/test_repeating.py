@@ -1,13 +1,12 @@
 """Starts about half a period off, on plates with a pattern: which period is right is told by nothing."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from service.scans.points.rigid import step_between
 from service.scans.points.scan import Scan
-from service.scans.registration.registration import NoneJoinedError, RegistrationOptions, register
+from service.scans.registration.registration import NoneJoinedError
+from tests.scenes.register import register, scan_with
 from tests.scenes.turntable import MM
 
 PERIOD, SIGMA = 5 * MM, 0.03 * MM
@@ -31,17 +30,14 @@ def plate(height, left_m: float, seed: int) -> Scan:
     origin = np.array([left_m + 0.06, 0, 1.0])
     sight = (points - origin) / np.linalg.norm(points - origin, axis=1)[:, None]
     points += sight * random.normal(0, SIGMA, len(points))[:, None]
-    return Scan(name=f"from {left_m:g} m", path=Path("scan"), points=points, sigma=np.full(len(points), SIGMA, np.float32),
-                sigma_source="measured", normals=None, colours=None, confidence=None, origin=origin,
-                camera=None, pixels=None, pose=None, pose_covariance=None, maps=None)
+    return scan_with(points, SIGMA, name=f"from {left_m:g} m", origin=origin)
 
 
 def registered(height, start_m: float, *, starts_decide: bool = False):
     """Two plates whose frames are that of the world, the second with a start beside its place."""
     start = np.eye(4)
     start[0, 3] = start_m
-    return register([plate(height, -0.08, 1), plate(height, -0.04, 2)], [np.eye(4), start],
-                    RegistrationOptions(threads=2, starts_decide=starts_decide))
+    return register([plate(height, -0.08, 1), plate(height, -0.04, 2)], [np.eye(4), start], starts_decide=starts_decide)
 
 
 @pytest.mark.long

@@ -1,7 +1,5 @@
 """Scans of a large place whose points are as far apart as its details are large, and of its statues from near, in squares of pixels."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,9 +9,9 @@ from service.scans.points.rigid import inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.fine import fit
 from service.scans.registration.pairs import PairState, prepare, refine
-from service.scans.registration.registration import RegistrationOptions, register
 from stage.capture.camera import Camera
 from tests.reference.projector import look_at
+from tests.scenes.register import register, scan_with
 
 SIGMA = 1e-3
 EYES = [((-3.0, 2.0, 0.5), (2.0, 1.0, 3.0)), ((-1.0, 2.2, -1.0), (3.0, 1.0, 2.0))]
@@ -28,9 +26,7 @@ def scan_of(number: int, camera: Camera, pose: np.ndarray, sigma: float, range_m
     assert distance(scene, exact[::20]).max() < 2e-6  # of single precision at 20 m
     depth = true + sigma * np.random.default_rng(number).standard_normal(true.shape)
     points = camera.points(-depth)[mask].astype(np.float32)
-    return Scan(name=str(number), path=Path("scan"), points=points, sigma=np.full(len(points), sigma, np.float32), sigma_source="measured",
-                normals=None, colours=None, confidence=None, origin=np.zeros(3), camera=camera,
-                pixels=np.flatnonzero(mask), pose=pose, pose_covariance=None, maps=None)
+    return scan_with(points, sigma, name=str(number), camera=camera, pixels=np.flatnonzero(mask), pose=pose)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +56,7 @@ def test_poses_of_squares_of_pixels_are_as_sure_as_they_say(monkeypatch):
 
 
 def test_a_courtyard_of_coarse_points_is_placed(scans):
-    found = register(scans, [scan.pose for scan in scans], RegistrationOptions())
+    found = register(scans, [scan.pose for scan in scans])
     first, second = (found.poses[number] @ inverse(scan.pose) for number, scan in enumerate(scans))
     step = step_between(inverse(first) @ second, np.array([2.0, 1.0, 2.0]))
     assert np.linalg.norm(step[3:]) < 10e-3 and np.degrees(np.linalg.norm(step[:3])) < 0.2

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from service.scans.points.rigid import applied, inverse, step_between
 from service.scans.points.scan import Scan, Target
 from service.scans.registration.pairs import Evidence, PairState
-from service.scans.registration.registration import Registration, RegistrationOptions, register
+from service.scans.registration.registration import Registration
 from service.scans.registration.target_pairs import TargetPose, pose_by_targets
+from tests.scenes.register import off, register, scan_of, seen
 from tests.scenes.turntable import MM, View, figure, pose, see, vase
-from tests.service.scans.registration.test_registration import off, scan_of, seen
 
 SIGMA = 0.1 * MM
 PLACES = {f"T{k}": np.array([0.45 * np.cos(angle), height, 0.45 * np.sin(angle)])
@@ -32,7 +32,7 @@ def with_targets(view: View, seed: int, **changed: np.ndarray | None) -> Scan:
 
 
 def registered(scans: list[Scan]) -> Registration:
-    return register(scans, [None] * len(scans), RegistrationOptions(threads=2))
+    return register(scans, [None] * len(scans))
 
 
 def vases(**changed_in_the_third) -> tuple[list[View], list[Scan]]:

@@ -12,9 +12,9 @@ from service.server.database import jobs
 from service.server.storage import layout
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
+from tests.scenes.register import seen
 from tests.scenes.turntable import figure
 from tests.service.joining.test_depth_and_normals import write
-from tests.service.scans.registration.test_registration import seen
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 
 pytestmark = pytest.mark.long

@@ -18,8 +18,8 @@ from service.server.database import jobs
 from service.server.storage import layout
 from stage.results.depth_maps import DepthMaps
 from stage.sets.scan_set import ScanEntry, ScanSet, read_scan_set, write_scan_set
+from tests.scenes.register import seen
 from tests.scenes.turntable import View, figure
-from tests.service.scans.registration.test_registration import seen
 from tests.service.server.jobs.harness import PROJECT, Harness, harness, no_pieces, shared
 from tests.service.server.jobs.test_sharing import WORKERS, both_at_work
 from tests.service.server_process import SABOTAGE

@@ -2,9 +2,9 @@
 
 import pytest
 
+from service.scans.registration.diagnosis import refusal
 from service.scans.registration.pair_tasks import NOT_THERE
 from service.scans.registration.pairs import Pair, PairState
-from service.scans.registration.refusals import refusal
 
 NO_POSE = "no pose brings enough of the two surfaces together"
 

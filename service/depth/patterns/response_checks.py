@@ -1,0 +1,205 @@
+"""Whether light is linear in the levels that a projector shows: the exponent γ of light = level^γ that waves show, and ramps.
+
+Between black and white the mean of a wave is a half, and readings of five frames or more lie off a wave that is bent. Three or four leave
+too few over for that. But the second harmonic adds to the fitted amplitude in turn with three times the phase; the amplitude over the mean
+does not depend on albedo, and under an unbent wave not on the phase. What else changes it, ambient light and blur, changes slowly over the
+wave or not with it at all.
+
+A rising ramp and the falling one are white and black together, at every place. Where the projector's response or the images bend light, the
+sum is least right half way between the borders; where the light has changed, it is wrong there as at the borders.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kernels.device import to_numpy
+from kernels.errors import KernelError
+from kernels.status import OK
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.phase import weights
+from kernels.structured.response import bent_wave, fitted_curve, light_of
+from service.depth.patterns.codes import choose_decoder
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.pattern_checks import ENOUGH, LEAST_SIGNAL, Sample, decode_sample
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.patterns.ramp import RampCode
+
+MEAN_TOLERANCE = 0.04
+"""Distance of the mean of a wave from half of white above which the projector is not linear; photographs have 0.01."""
+EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
+"""Exponents of light = level^γ that are compared."""
+BAD_FIT, BETTER_FIT = 3.0, 0.5
+"""Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
+IN_A_BIN = 30
+"""Pixels that tell the modulation in a part of a turn, or the sum of ramps in a part of the way between the borders."""
+TURN_BINS, LEAST_TURN_BINS = 36, 24
+"""Parts of a turn, and number of these that must be seen."""
+CLEAR_SIGMAS = 20.0
+"""Least amplitude of pixels that tell the modulation, in its standard deviations."""
+TREND = 3
+"""Number of terms of the polynomial that other changes of the modulation may follow along the wave."""
+MISFIT = 0.25
+"""Part of the misfit of an unbent wave that a bent one must leave at most."""
+LEAST_CHANGE = 0.02
+"""Root mean square change of the modulation along the wave, as a part of it, below which it is even."""
+RAMP_BINS, LEAST_RAMP_BINS = 20, 8
+"""Parts of the way between the borders, and number of these that must be seen."""
+MOST_BENT, MOST_CHANGED = 0.08, 0.12
+"""Largest part of white minus black by which bent light makes the sum wrong half way, and changed light anywhere: lamps flicker by less,
+and images that were sharpened have 0.05."""
+STEPS = 1024
+"""Number of places at which a declared response is looked up."""
+
+
+def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> float:
+    """Return the exponent γ of light = level^γ that the waves of a capture show; 1.0 where they are as they should be."""
+    for code in collected.codes:
+        if isinstance(code, PhaseCode):
+            found = _exponent_of_mean(sample, code, collected, noise)
+            if found is None:
+                found = _exponent_of_fit(sample, code, collected, projector, noise, device)
+            if found != 1.0:
+                return found
+    return 1.0
+
+
+def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noise: NoiseModel) -> float | None:
+    """Return the exponent from the mean of the waves between black and white; None without frames that tell them."""
+    grey = sample.grey
+    if collected.white is not None and collected.black is not None:
+        dark, span = grey[collected.black], grey[collected.white] - grey[collected.black]
+    else:
+        pair = next((other for other in collected.codes if isinstance(other, BinaryCode) and other.inverses is not None), None)
+        if pair is None or pair.inverses is None:
+            return None
+        span = np.max([np.abs(grey[a] - grey[b]) for a, b in zip(pair.frames, pair.inverses, strict=True)], axis=0)
+        dark = 0.5 * (grey[pair.frames[-1]] + grey[pair.inverses[-1]] - span)
+    good = sample.whole & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
+    if good.sum() < ENOUGH:
+        return None
+    even = [list(wave.frames) for wave in code.waves
+            if len(wave.frames) >= FULL_STEPS and abs(np.exp(2j * np.pi * np.array(wave.shifts)).sum()) < 1e-6]
+    if not even:
+        return None
+    means = [np.median((np.mean(grey[frames], axis=0)[good] - dark[good]) / span[good]) for frames in even]
+    mean = float(np.median(means))
+    if abs(mean - 0.5) <= MEAN_TOLERANCE:
+        return 1.0
+    fine = np.linspace(0.3, 4.0, 371)
+    table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
+    return float(np.interp(-mean, -np.array(table), fine))
+
+
+def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
+                     device: str) -> float:
+    """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
+    grey = sample.grey[list(code.frames)].astype(np.float64)
+    if len(code.frames) < 5:  # offset, amplitude and place leave one reading over at most
+        alone = len(set(code.periods_px)) == 1
+        return _exponent_of_swing(grey[:, sample.whole], code.shifts, code.periods_px[0], noise) if alone else 1.0
+    variance = noise.variance(grey.mean(axis=0))
+    misfit = {}
+    for exponent in EXPONENTS:
+        response = np.linspace(0, 1, 256)**exponent
+        bent = projector._replace(response=None if exponent == 1.0 else tuple(response.tolist()))
+        try:
+            decoder, _ = choose_decoder(collected, code.axis, bent)
+            if decoder is None:
+                return 1.0
+            decoded = decode_sample(sample, decoder, noise, device)
+        except KernelError:  # two places look alike under this response
+            continue
+        u, status = (to_numpy(array)[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
+        keep = (status == OK) & sample.mask.ravel()
+        if keep.sum() < ENOUGH:
+            continue
+        wave = bent_wave(response)
+        turns = (u[keep] / np.array(code.periods_px)[:, None] - np.array(code.shifts)[:, None]) % 1.0
+        light = np.interp(turns, np.arange(len(wave) + 1) / len(wave), np.append(wave, wave[0]))
+        light -= light.mean(axis=0)
+        seen = grey[:, keep] - grey[:, keep].mean(axis=0)
+        rest = (seen**2).sum(axis=0) - (light * seen).sum(axis=0)**2 / np.maximum((light**2).sum(axis=0), 1e-12)
+        misfit[exponent] = float(np.median(rest / variance[keep]) / (len(code.frames) - 3))
+    plain = misfit.get(1.0, float("nan"))
+    if not misfit or not plain > BAD_FIT:
+        return 1.0
+    best = min(misfit, key=lambda exponent: misfit[exponent])
+    return best if misfit[best] < BETTER_FIT * plain else 1.0
+
+
+def _exponent_of_swing(grey: np.ndarray, shifts: Sequence[float], period_px: float, noise: NoiseModel) -> float:
+    """Return the exponent γ of light = level^γ that explains how the modulation changes along the wave; 1.0 where it does not change so.
+    `grey`: [frames, pixels] readings of one period, without saturated ones. `shifts`: of each frame in turns."""
+    own = np.array(shifts)
+    table = weights(own, period_px)
+    mean, along, across = table.T @ grey
+    swing = np.hypot(along, across)
+    deviation = np.sqrt(noise.variance(mean) * (table[:, 1:]**2).sum(axis=0).max())
+    good = (swing > CLEAR_SIGMAS * deviation) & (mean > 0)
+    ratio = np.log(swing[good] / mean[good])
+    place = (np.arctan2(across[good], along[good]) / (2 * np.pi) % 1.0 * TURN_BINS).astype(int) % TURN_BINS
+    seen = np.flatnonzero(np.bincount(place, minlength=TURN_BINS) >= IN_A_BIN)
+    if len(seen) < LEAST_TURN_BINS:
+        return 1.0
+    modulation = np.array([np.median(ratio[place == part]) for part in seen])
+    turns = (seen + 0.5) / TURN_BINS
+    trend = np.vander(turns - 0.5, TREND)
+    misfit = {}
+    for exponent in EXPONENTS:
+        curve, level = fitted_curve(bent_wave(np.linspace(0, 1, 256)**exponent), table, own)
+        fitted = np.angle(curve) / (2 * np.pi) % 1.0
+        order = np.argsort(fitted)
+        expected = np.interp(turns, fitted[order], np.log(np.abs(curve) / level)[order], period=1.0)
+        rest = modulation - expected
+        misfit[exponent] = float(np.sqrt(np.mean((rest - trend @ np.linalg.lstsq(trend, rest, rcond=None)[0])**2)))
+    best = min(misfit, key=lambda exponent: misfit[exponent])
+    return best if misfit[1.0] > LEAST_CHANGE and misfit[best]**2 < MISFIT * misfit[1.0]**2 else 1.0
+
+
+def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
+    """Return what is said of waves that a projector bends."""
+    done = ("the error that this makes is" if found.left_rad is None else
+            f"they were bent back by it, and the {found.left_rad:.2g} rad that this leaves are")
+    return (f"projector.response: is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear: {done} "
+            f"in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")
+
+
+def check_ramps(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
+    """Return a sentence if two ramps are not white and black together. `noise`: that of the frames, as measured: pixels that are chosen by
+    less are those whose white is too bright by chance."""
+    if collected.white is None or collected.black is None:
+        return None
+    grey = sample.grey
+    black = grey[collected.black]
+    whole = grey[collected.white] - black
+    variance = noise.variance(grey[collected.white])
+    lit = sample.whole & (whole > LEAST_SIGNAL * np.sqrt(2 * variance))
+    for code in collected.codes:
+        if not isinstance(code, RampCode) or code.up is None or code.down is None or lit.sum() < ENOUGH:
+            continue
+        up, down = ((grey[number] - black)[lit] / whole[lit] for number in (code.up, code.down))
+        light = light_of(projector.response, np.linspace(0, 1, STEPS))
+        together = light + light[::-1]
+        ratio = up / np.maximum(up + down, 1e-6)
+        over = up + down - np.interp(ratio, light / together, together)
+        place = np.clip(ratio * RAMP_BINS, 0, RAMP_BINS - 1).astype(int)
+        seen = np.flatnonzero(np.bincount(place, minlength=RAMP_BINS) >= IN_A_BIN)
+        if len(seen) < LEAST_RAMP_BINS:
+            continue
+        middle = (seen + 0.5) / RAMP_BINS
+        terms = np.stack([np.ones(len(seen)), middle - 0.5, 4 * middle * (1 - middle)], axis=1)
+        fitted = np.linalg.lstsq(terms, np.array([np.median(over[place == part]) for part in seen]), rcond=None)[0]
+        changed = float(np.abs(terms[:, :2] @ fitted[:2]).max())
+        if abs(fitted[2]) > max(MOST_BENT, changed):
+            half_way = max(1 + fitted[0] + fitted[2], 0.1)
+            exponent = 1 - np.log2(half_way)
+            return (f"frames: half way between the borders the two {code.axis} ramps are {100 * half_way:.0f} % of white and black "
+                    f"together, as where light = level^{exponent:.2g}: a ramp is only as right as its light is linear; measure "
+                    "projector.response (relit calibrate response), or check color_space, if the images are what is not linear")
+        if changed > MOST_CHANGED:
+            return (f"frames: the two {code.axis} ramps differ from white and black together by up to {100 * changed:.0f} % of white: the "
+                    "light has changed between the frames, dark readings were cut off, or frames do not show what is declared")
+    return None
