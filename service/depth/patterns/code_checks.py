@@ -13,7 +13,8 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.levels import contrasts
-from service.depth.patterns.pattern_checks import ENOUGH, EXPONENTS, Sample
+from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.response_checks import EXPONENTS
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.kary import KaryCode, number_of
