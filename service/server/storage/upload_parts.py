@@ -153,15 +153,16 @@ class UploadParts:
         return removed
 
     def _drop_leftovers(self, before: float) -> None:
-        """Delete the part files that were not written since a time and have no upload."""
-        old = set[str]()
-        for path in self._folder.glob(f"*{SUFFIX}"):
+        """Delete the part files, and copies of them that were sent, that were not written since a time and have no upload."""
+        old = dict[Path, str]()
+        for path in self._folder.glob(f"*{SUFFIX}*"):
             with suppress(FileNotFoundError):
                 if path.stat().st_mtime < before:
-                    old.add(path.stem)
-        for name in old - uploads.unfinished_of(self._database, old):
-            with storage_errors("remove", self._path(name)):
-                self._path(name).unlink(missing_ok=True)
+                    old[path] = path.name.partition(SUFFIX)[0]
+        unfinished = uploads.unfinished_of(self._database, set(old.values()))
+        for path in (path for path, name in old.items() if name not in unfinished):
+            with storage_errors("remove", path):
+                path.unlink(missing_ok=True)
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}{SUFFIX}"
