@@ -334,9 +334,9 @@ def findings(capture: Capture, looked: Grid, recorded: Mapping[str, np.ndarray])
     named = {lit[each.light][0].image: each.misfit for each in off}
     if not named:
         return Findings([], {})
-    some = ", ".join(f"{image} (by {100 * misfit:.0f} %)" for image, misfit in list(named.items())[:MOST_NAMED])
+    listed = ", ".join(f"{image} (by {100 * misfit:.0f} %)" for image, misfit in list(named.items())[:MOST_NAMED])
     more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
-    return Findings([f"frames[].light: readings disagree with those under the other lights in {some}{more}: check the direction and "
+    return Findings([f"frames[].light: readings disagree with those under the other lights in {listed}{more}: check the direction and "
                      "irradiance of these lights"], named)
 
 

@@ -12,35 +12,15 @@ from scipy.ndimage import uniform_filter1d
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
 from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.digit_checks import check_digits
 from service.depth.patterns.levels import contrasts
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
-from service.depth.patterns.response_checks import EXPONENTS
+from service.depth.patterns.stripe_steps import AT_A_PLACE, BEYOND_SHARE, CLEAR_BIT, CLEAR_SIGMAS, JUMP, READ_SHARE, Pairs, mends
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
-from stage.patterns.kary import KaryCode, number_of
+from stage.patterns.kary import KaryCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 
-CLEAR_BIT, CLEAR_SIGMAS = 0.4, 4.0
-"""A bit is read where its contrast is this part of the largest of the pixel's bits, and this many deviations."""
-READ_SHARE = 0.5
-"""Finer bits than the first that fewer of the pixels read are left out."""
-REACH = 3
-"""Largest distance in pixels of two pixels of a row whose stripes are compared."""
-JUMP = 4.0
-"""Steps between neighbours, in the usual number of stripes, from which on they are jumps."""
-SHORTER, NO_LONGER = 0.8, 0.98
-"""The mean logarithm of the steps of another order, over that of the declared one, below which it is named, and below which it is where it
-mends jumps too."""
-PLACES, AT_A_PLACE, OF_STEPS = 3, 8, 0.01
-"""Number of places of the code at which another order of bits mends jumps, of image rows in which it does so at each, and least part of the
-steps, from which on that order is named. An edge of depth jumps between other stripes in every row."""
-MENDED = 5.0
-"""Jumps that another order mends over those that it makes."""
-LEFT_JUMPS = 0.1
-"""Jumps, as a part of all steps, below which stripes of k-ary digits follow each other."""
-BENT_LEFT, LEAST_BENT = 0.65, 0.02
-"""Part of the mean distance of readings from the levels of digits, of white, that levels of another exponent leave, and least distance,
-from which on that exponent is named: noise, blur and bounced light leave more with any other."""
 DENSE = 0.8
 """Part of the neighbours with other bits that differ in one alone, from which on they lie in stripes side by side: stripes three apart may
 differ in one bit too."""
@@ -49,8 +29,6 @@ CONTRADICTED, FOLLOWED = 0.25, 0.4
 of bits is wrong, and above the second for every bit, it is right. In scenes full of edges it is 0.73 at least for the right order."""
 LEAST_ROWS = 5
 """Number of image rows in which a bit must change at such neighbours to be judged."""
-BEYOND_SHARE = 0.02
-"""Share of the neighbours whose stripes lie beyond the projector, side by side, from which on its size is doubted."""
 LEAST_PERIODS = 4
 """Number of periods that must be seen for a wave to be compared: over fewer, uneven light makes other periods fit as well."""
 CLEAR_WAVE = 0.4
@@ -83,68 +61,10 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
                 if found is not None:
                     return f"frames: {found}"
         elif isinstance(code, KaryCode):
-            found = _check_digits(sample, code, collected, projector, noise)
+            found = check_digits(sample, code, collected, projector, noise)
             if found is not None:
                 return f"frames: {found}"
     return None
-
-
-def _check_digits(sample: Sample, code: KaryCode, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
-    """Return how digits are declared wrongly; None if stripes follow each other as declared, or few pixels read the coarser digits."""
-    if code.lacks(collected.white, collected.black) is not None:
-        return None
-    light, levels = sample.digit_light(code), projector.levels_of(code)
-    white, black = light[collected.white], light[collected.black]
-    contrast = np.maximum(white - black, 1e-9)
-    part = (light[list(code.frames)] - black) / contrast
-    deviation = (np.sqrt(2 * noise.variance(white)) / contrast).max(axis=0)
-    gap = min(float(np.abs(one - other).max()) for one, other in combinations(levels, 2))
-
-    def read(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest digits [digits, pixels], and whether they are near."""
-        away = np.abs(part - levels[:, None, :, None]).max(axis=2)
-        return away.argmin(axis=0), away.min(axis=0) < CLEAR_BIT / 2 * gap
-
-    digits, clear = read(levels)
-    others = []
-    if code.colors is not None:
-        turned, also = read(levels[:, ::-1])
-        clear = clear | also
-        others.append(("red and blue are exchanged: check the order of the channels in the images", turned, code.reflected))
-    lit = sample.lit(sample.grey, noise) & (deviation * CLEAR_SIGMAS < gap / 2)
-    if code.colors is None and projector.response is None and lit.sum() >= ENOUGH:
-        coarse = part[len(part) // 2 :, 0, lit, None]
-        away = {exponent: float(np.abs(coarse - levels[:, 0] ** exponent).min(axis=-1).mean()) for exponent in EXPONENTS}
-        bent = min(away, key=lambda exponent: away[exponent])
-        if away[bent] < BENT_LEFT * away[1.0] and away[1.0] > LEAST_BENT:
-            return (f"the digits of the {code.axis} kary code look like light = level^{bent:g}: give the light that is shown as levels, or "
-                    "measure projector.response with relit calibrate response; check color_space of the images too")
-    read_well = np.flatnonzero(clear[: 1 + len(digits) // 2, lit].sum(axis=1) >= READ_SHARE * max(int(lit.sum()), 1))
-    if not len(read_well):
-        return None
-    finest = int(read_well[0])
-    pairs = _Pairs.of((lit & clear[finest:].all(axis=0)).reshape(sample.mask.shape))
-    steps = pairs.steps(number_of(digits[finest:], code.base, reflected=code.reflected))
-    if len(steps) < ENOUGH or not steps.any():
-        return None
-    jumps = steps > JUMP * max(float(np.median(steps[steps > 0])), 1.0)
-    count = projector.extent(code.axis) / code.without(finest).stripe_px
-    others.append((f"reflected is {str(not code.reflected).lower()} in the frames' patterns: check it", digits, not code.reflected))
-    for first, second in combinations(range(finest, len(digits)), 2):
-        order = np.arange(len(digits))
-        order[[first, second]] = second, first
-        others.append((f"the digits {first} and {second} are exchanged: check digit in the frames' patterns", digits[order],
-                       code.reflected))
-    mended = []
-    for words, shown, reflected in others:
-        numbers = number_of(shown[finest:], code.base, reflected=reflected)
-        better, after = _mends(numbers, pairs, steps, jumps, count, outside=False), pairs.steps(numbers)
-        after = after[after > 0]
-        if better is not None and (after > JUMP * np.median(after)).mean() < LEFT_JUMPS:  # more where the camera moves between frames
-            mended.append((better, words))
-    if not mended:
-        return None
-    return f"the {code.axis} stripes of the kary code do not follow each other as declared; they do if {min(mended)[1]}"
 
 
 def read_stripes(sample: Sample, code: BinaryCode, collected: Collected, noise: NoiseModel) -> Stripes | None:
@@ -183,28 +103,9 @@ def _numbers(bits: np.ndarray, *, gray: bool) -> np.ndarray:
     return np.tensordot(1 << np.arange(len(bits)), bits, 1)
 
 
-class _Pairs(NamedTuple):
-    first: np.ndarray  # [pairs] index into the flat sample
-    second: np.ndarray  # [pairs]
-    row: np.ndarray  # [pairs]
-
-    @classmethod
-    def of(cls, known: np.ndarray) -> "_Pairs":
-        """Return each pixel with the next of its row that is known, if it is near."""
-        width = known.shape[1]
-        at = np.flatnonzero(known)
-        near = (at[1:] - at[:-1] <= REACH) & (at[1:] // width == at[:-1] // width)
-        return cls(at[:-1][near], at[1:][near], at[1:][near] // width)
-
-    def steps(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the distance of their stripes, [pairs]."""
-        flat = numbers.ravel()
-        return np.asarray(np.abs(flat[self.second] - flat[self.first]))
-
-
 def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
     """Return what bits are declared wrongly, or how wide the projector looks; None if stripes follow each other as declared."""
-    pairs = _Pairs.of(stripes.known)
+    pairs = Pairs.of(stripes.known)
     declared = _numbers(stripes.bits, gray=code.name != "binary")
     steps = pairs.steps(declared)
     if len(steps) < ENOUGH:
@@ -224,7 +125,7 @@ def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
         mended: list[tuple[float, str]] = []
         for other, swap in [*orders, *((code.name, swap) for swap in swaps)]:
             bits = stripes.bits if swap is None else _with_exchanged(stripes.bits, swap)
-            part = _mends(_numbers(bits, gray=other != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside))
+            part = mends(_numbers(bits, gray=other != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside))
             words = (f"a {code.name} code is declared, and they follow each other as those of a {other} code: check code in the frames' "
                      "patterns" if swap is None
                      else f"they follow each other if {_exchange_words(swap, stripes)}")
@@ -249,7 +150,7 @@ def _exchange_words(swap: tuple[int, int], stripes: Stripes) -> str:
     return f"the bits {' and '.join(str(bit + stripes.finest) for bit in swap)} are exchanged: check bit in the frames' patterns"
 
 
-def _exchanged(bits: np.ndarray, pairs: _Pairs) -> tuple[int, int] | None:
+def _exchanged(bits: np.ndarray, pairs: Pairs) -> tuple[int, int] | None:
     """Return two bits of a Gray code that are exchanged, None if none are: stripes side by side differ in one bit, and few others do,
     unless neighbouring pixels lie several stripes apart. Then the finest bits are left out."""
     flat = bits.reshape(len(bits), -1)
@@ -272,26 +173,6 @@ def _exchanged(bits: np.ndarray, pairs: _Pairs) -> tuple[int, int] | None:
         return None
     likely, swap = max((following(_with_exchanged(ends, swap)), swap) for swap in combinations(range(len(flat)), 2))
     return (swap[0] + finest, swap[1] + finest) if likely >= FOLLOWED else None
-
-
-def _mends(numbers: np.ndarray, pairs: _Pairs, declared: np.ndarray, jumps: np.ndarray, count: float, *, outside: bool) -> float | None:
-    """Return the mean logarithm of the steps under other numbers of the stripes over that under the declared ones, if the stripes follow
-    each other much better so; else None.
-    `declared`: [pairs] steps as declared, and `jumps` among them. `count`: number of stripes that the projector shows. `outside`:
-    whether stripes lie beyond the projector as declared."""
-    steps, flat = pairs.steps(numbers), numbers.ravel()
-    if (flat[pairs.first] >= count).mean() > BEYOND_SHARE or not steps.any():
-        return None
-    part = float(np.log2(1 + steps).sum() / np.log2(1 + declared).sum())
-    if part < SHORTER:
-        return part
-    usual = max(float(np.median(steps[steps > 0])), 1.0)
-    mended, made = jumps & (steps <= 2 * usual), ~jumps & (steps > JUMP * usual)
-    if part > NO_LONGER or mended.sum() < max(MENDED * made.sum(), OF_STEPS * (declared > 0).sum()) or jumps.sum() > 2 * mended.sum():
-        return None
-    place = (flat[pairs.first] + flat[pairs.second])[mended] // int(4 * usual)
-    rows = [len(np.unique(pairs.row[mended][place == key])) for key in np.unique(place)]
-    return part if sum(number >= AT_A_PLACE for number in rows) >= PLACES - outside else None
 
 
 def _check_waves(sample: Sample, stripes: Stripes, code: BinaryCode, collected: Collected, noise: NoiseModel) -> str | None:

@@ -20,8 +20,8 @@ def sample_of(readings, lights):
 @pytest.mark.parametrize("ball", [60, 100])
 @pytest.mark.parametrize("alpha", [0.16, 0.3])
 def test_a_ball_before_a_metal_plane_tells_that_lights_are_right(ball, alpha):
-    """Of a metal plane, light by light, any brightness and any directions of the lights explain the images: the ball refutes them, however
-    the normals of a Lambertian fit of the plane scatter."""
+    """Any brightness of each light, and any directions, explain the readings of a metal plane, whose Lambertian normals scatter. The ball
+    refutes them."""
     draw = np.random.default_rng(3)
     lights = fibonacci_sphere(60)
     lights = lights[lights[:, 2] > 0.4][:16]

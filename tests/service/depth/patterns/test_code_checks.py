@@ -87,7 +87,7 @@ def test_digits_that_are_declared_otherwise_are_named(scene, base, reflected):
 
 @pytest.mark.parametrize("base", [3, 4, 5])
 def test_digits_that_a_projector_shows_as_a_power_of_their_levels_are_named(scene, base):
-    """Of base 4 two thirds of the pixels were solved, most of them at other stripes, without a word."""
+    """Two thirds of the pixels of a code of base 4 were solved without a word, most of them at other stripes."""
     declared = kary(base)
     shows = changed(declared, "kary", levels=lambda p: [level**2.2 for level in p["levels"]])
     assert "look like light = level^2.2" in said(scene, shows, declared)
