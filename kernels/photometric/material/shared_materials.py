@@ -3,8 +3,9 @@
 A pixel sees a highlight under a light or two, or under none, and cannot tell a faint wide lobe from a bright narrow one; another
 pixel of the same material can. Candidates are materials that pixels found for themselves; the one that lowers the total cost most
 is taken, then the one that lowers it most beside the first, and so on while it pays; a surface without a lobe comes first where no lobe
-pays. F0 of a dielectric follows from its refractive index alone, which differs little between paints, plastics and skin, while a pixel
-trades F0 for roughness: so all dielectrics of the object have one F0 unless F0 of their own pay.
+pays. The roughness of each is then moved to where the total is least. F0 of a dielectric follows from its refractive index alone, which
+differs little between paints, plastics and skin, while a pixel trades F0 for roughness: so all dielectrics of the object have one F0 unless
+F0 of their own pay.
 
 Source: materials as few and mixed per pixel, after Goldman et al., "Shape and spatially-varying BRDFs from photometric stereo",
 TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
@@ -13,6 +14,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 import numpy as np
 
 from kernels.photometric.material.material import MATT, Material, fit_given, fit_material, is_dielectric
+from kernels.photometric.material.material_kernel import ROUGHNESS_FIRST
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.hypotheses import Diffuse
 
@@ -25,6 +27,9 @@ LEAST_GAIN = 0.01
 LOBE_GAIN = 0.05
 """Fraction of the total cost that a lobe must save over none at all: in hollows, bounced light that is left in the readings passes for a
 faint lobe, which saves up to 0.03; lobes of rough dielectrics save 0.07 and more."""
+ROUGHNESS_STEPS = (0.06, 0.03, 0.015)
+"""Steps by which the roughness of each chosen material is moved either way where that lowers the total cost: those of candidates scatter by
+about the first, and pixels tell two roughnesses apart to about the last."""
 LEAST_F0 = 0.005
 """Least F0 that dielectrics have in common: that of a refractive index of 1.15, below every solid."""
 F0_GRID, F0_HALVINGS = 5, 4
@@ -52,7 +57,25 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
             break
         materials.append(index)
         best = np.minimum(best, costs[index])
-    return _with_one_f0(samples, normal, candidates[materials].astype(np.float32), costs[materials], shape=shape)
+    return _with_one_f0(samples, normal, *_settle_roughness(samples, normal, candidates[materials].astype(np.float32), costs[materials],
+                                                            shape=shape), shape=shape)
+
+
+def _settle_roughness(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *,
+                      shape: Diffuse) -> tuple[np.ndarray, np.ndarray]:
+    """Return the materials, [materials, 4], with the roughness at which the total cost beside the others is least, and their costs,
+    [materials, n]."""
+    materials, costs = materials.copy(), costs.copy()
+    for step in ROUGHNESS_STEPS:
+        for index in np.flatnonzero((materials != MATT).any(axis=1)):
+            others = np.delete(costs, index, axis=0).min(axis=0, initial=np.inf)
+            for moved in (-step, step):
+                tried = materials[index].copy()
+                tried[3] = np.clip(tried[3] + moved, ROUGHNESS_FIRST, 1)
+                cost = fit_given(samples, normal, tried, shape=shape).cost
+                if np.minimum(cost, others).sum(dtype=np.float64) < np.minimum(costs[index], others).sum(dtype=np.float64):
+                    materials[index], costs[index] = tried, cost
+    return materials, costs
 
 
 def best_dielectric(samples: Samples, normal: np.ndarray, shared: np.ndarray | None, *, shape: Diffuse) -> Material:

@@ -230,7 +230,7 @@ class _Walk:
             return kinds
         read, normal, options = partial(self._read, light=light), self.result.normal, self._options
         kinds.tell_apart(to_numpy(light.solved).reshape(-1), self._solvable, read, normal)
-        kinds.find_materials(self._solvable, read, normal, metals=options.metals, mixtures=options.mixtures)
+        kinds.find_materials(self._solvable, read, normal, self._given.camera.width, metals=options.metals, mixtures=options.mixtures)
         whole, *others = ({"pixels": int((kinds.which[self._solvable] == number).sum()), **kind.report()}
                           for number, kind in enumerate(kinds.kinds))
         self.result.facts["shared_materials"] = whole["shared_materials"]

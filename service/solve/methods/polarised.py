@@ -18,13 +18,12 @@ from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.model.misfit import LARGEST_ERROR
-from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.hypotheses import Diffuse
 from kernels.status import ESTIMATED
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import SeparatedPairs, Solution, SolveInput
-from service.solve.methods.kinds import MATERIAL_PIXELS, material_report
+from service.solve.methods.kinds import material_report, smoothest
 from service.solve.methods.near import NormalSolver
 from service.solve.methods.pairs import PairFindings, examine_pairs
 from stage.capture.capture import Capture
@@ -145,7 +144,7 @@ def _fit_lobes(given: SolveInput, lights: Lights, field: NearField | None, solut
     stack = OnDiffuseModel.of(given.pairs.specular, given.stack, model)
     here, lit = replace(given, stack=stack), lights._replace(scale=stack.scale)
     view, shape = view_directions(given.camera), Diffuse()
-    spread = pixels[evenly(len(pixels), MATERIAL_PIXELS)]
+    spread = smoothest(pixels, solution.normal, given.camera.width)
     samples = pick_pixels(here, lit, view, spread, field)
     materials = choose_materials(samples, solution.normal[:, spread].T, shape=shape)
     solution.facts["shared_materials"] = material_report(materials)

@@ -1,6 +1,7 @@
 """Materials that pixels share, and the colour of highlights, on surfaces rendered by the independent float64 model."""
 
 import numpy as np
+import pytest
 
 from kernels.photometric.material.material import COST_FLOOR, FAR_F0, SHARED_RISE, Material, fit_given, fit_material
 from kernels.photometric.material.shared_materials import LEAST_GAIN, MOST, choose_materials
@@ -65,11 +66,21 @@ def test_both_materials_are_told_apart(device):
     assert (np.abs(material.roughness - rough)[~away] < 0.125).mean() > 0.95
 
 
-def lobes(f0, rough):
-    """[3, light, pixel] radiance with 3 % noise, seed fixed, and normals of 60 pixels for each pair of an F0 and a roughness."""
+def lobes(f0, rough, noise=0.03, seed=7):
+    """[3, light, pixel] radiance with noise in parts of it, and normals of 60 pixels for each pair of an F0 and a roughness."""
     normal = tilted(60, 20.0)
     radiance = np.concatenate([render(normal, alpha=r**2, f0=f) for f, r in zip(f0, rough, strict=True)], axis=2)
-    return radiance * (1 + 0.03 * np.random.default_rng(7).normal(size=radiance.shape)), np.tile(normal, (len(f0), 1))
+    return radiance * (1 + noise * np.random.default_rng(seed).normal(size=radiance.shape)), np.tile(normal, (len(f0), 1))
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_the_roughness_of_shared_materials_is_that_of_all_their_pixels(seed, device):
+    """Under 10 % noise the best of single pixels are 0.06 and 0.05 too smooth; moved to where all pixels cost least they err by 0.03, the
+    noise of 60 pixels, and less."""
+    radiance, normal = lobes((0.04, 0.04), (0.33, 0.58), noise=0.1, seed=seed)
+    shared = choose_materials(sample(radiance, device)[0], normal, shape=LAMBERT)
+    for rough in (0.33, 0.58):
+        assert np.abs(shared[:, 3] - rough).min() < 0.04
 
 
 def test_dielectrics_have_one_f0(device):
