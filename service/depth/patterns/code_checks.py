@@ -27,6 +27,8 @@ differ in one bit too."""
 CONTRADICTED, FOLLOWED = 0.25, 0.4
 """Part of the neighbours that differ in one bit of a Gray code alone whose stripes follow each other: below the first for a bit, the order
 of bits is wrong, and above the second for every bit, it is right. In scenes full of edges it is 0.73 at least for the right order."""
+INVERTED = 0.7
+"""The same part where dark and bright are exchanged, from which on all bits are inverted: exchanged bits and orders reach less."""
 LEAST_ROWS = 5
 """Number of image rows in which a bit must change at such neighbours to be judged."""
 LEAST_PERIODS = 4
@@ -64,6 +66,26 @@ def check_codes(sample: Sample, collected: Collected, projector: PatternProjecto
             found = check_digits(sample, code, collected, projector, noise)
             if found is not None:
                 return f"frames: {found}"
+    return None
+
+
+def check_inverted(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
+    """Return a sentence if the stripes of a Gray or XOR code follow each other only if dark and bright are exchanged in all of its bits.
+    A plain binary code is mirrored by that, which the geometry alone tells."""
+    for code in collected.codes:
+        if not isinstance(code, BinaryCode) or code.name == "binary":
+            continue
+        stripes = read_stripes(sample, code, collected, noise)
+        edges = None if stripes is None else Edges.of(stripes.bits, Pairs.of(stripes.known))
+        if stripes is None or edges is None or edges.following() >= CONTRADICTED:
+            continue
+        inverted = edges.ends.copy()
+        inverted[:None if code.name == "gray" else code.base_bit + 1 - stripes.finest - edges.finest] ^= True  # the base turns coarser bits
+        if edges.following(inverted) >= INVERTED:
+            words = ("patterns and inverses are exchanged: check inverse in the frames' patterns" if code.inverses is not None else
+                     f"dark and bright are exchanged in all bits of the {code.name} code: give the images of the patterns, not of their "
+                     "inverses, or invert these images")
+            return f"frames: neighbouring {code.axis} stripes follow each other only if {words}"
     return None
 
 
@@ -150,29 +172,43 @@ def _exchange_words(swap: tuple[int, int], stripes: Stripes) -> str:
     return f"the bits {' and '.join(str(bit + stripes.finest) for bit in swap)} are exchanged: check bit in the frames' patterns"
 
 
-def _exchanged(bits: np.ndarray, pairs: Pairs) -> tuple[int, int] | None:
-    """Return two bits of a Gray code that are exchanged, None if none are: stripes side by side differ in one bit, and few others do,
-    unless neighbouring pixels lie several stripes apart. Then the finest bits are left out."""
-    flat = bits.reshape(len(bits), -1)
-    changes = flat[:, pairs.first] != flat[:, pairs.second]
-    counts = np.cumsum(changes[::-1], axis=0)[::-1]  # of changes in each bit and all coarser ones
-    dense = [bit for bit, count in enumerate(counts[:-2]) if (count == 1).sum() >= DENSE * (count > 0).sum()]
-    if not dense:
-        return None
-    finest = dense[0]
-    flat, changes, alone = flat[finest:], changes[finest:], counts[finest] == 1
-    ends = flat[:, np.stack([pairs.first, pairs.second])[:, alone]]  # [bits, 2, pairs]
-    edges = [edge for edge in changes[:, alone] if len(np.unique(pairs.row[alone][edge])) >= LEAST_ROWS]
+class Edges(NamedTuple):
+    """Near pixels of a row that differ in one bit of a Gray code alone: right bits put them into stripes side by side."""
 
-    def following(order: np.ndarray) -> float:
-        first, second = _numbers(order, gray=True)
+    ends: np.ndarray  # [bits, 2, pairs] bool, without finer bits that do not change one after another
+    of_bit: list[np.ndarray]  # [pairs] bool each: where a bit changes, of the bits that change in enough rows
+    finest: int
+    """Number of finer bits that are left out."""
+
+    @classmethod
+    def of(cls, bits: np.ndarray, pairs: Pairs) -> "Edges | None":
+        """Return those pairs; stripes side by side differ in one bit, and few others do, unless neighbouring pixels lie
+        several stripes apart. Then the finest bits are left out; None if all are."""
+        flat = bits.reshape(len(bits), -1)
+        changes = flat[:, pairs.first] != flat[:, pairs.second]
+        counts = np.cumsum(changes[::-1], axis=0)[::-1]  # of changes in each bit and all coarser ones
+        dense = [bit for bit, count in enumerate(counts[:-2]) if (count == 1).sum() >= DENSE * (count > 0).sum()]
+        if not dense:
+            return None
+        finest = dense[0]
+        flat, changes, alone = flat[finest:], changes[finest:], counts[finest] == 1
+        ends = flat[:, np.stack([pairs.first, pairs.second])[:, alone]]
+        return cls(ends, [edge for edge in changes[:, alone] if len(np.unique(pairs.row[alone][edge])) >= LEAST_ROWS], finest)
+
+    def following(self, ends: np.ndarray | None = None) -> float:
+        """Return the least part, of all bits, of the pairs whose stripes follow each other; `ends` are other bits of the pairs."""
+        first, second = _numbers(self.ends if ends is None else ends, gray=True)
         follow = np.abs(second - first) == 1
-        return min((float(follow[edge].mean()) for edge in edges), default=1.0)
+        return min((float(follow[edge].mean()) for edge in self.of_bit), default=1.0)
 
-    if following(ends) >= CONTRADICTED:
+
+def _exchanged(bits: np.ndarray, pairs: Pairs) -> tuple[int, int] | None:
+    """Return two bits of a Gray code that are exchanged; None if none are."""
+    edges = Edges.of(bits, pairs)
+    if edges is None or edges.following() >= CONTRADICTED:
         return None
-    likely, swap = max((following(_with_exchanged(ends, swap)), swap) for swap in combinations(range(len(flat)), 2))
-    return (swap[0] + finest, swap[1] + finest) if likely >= FOLLOWED else None
+    likely, swap = max((edges.following(_with_exchanged(edges.ends, swap)), swap) for swap in combinations(range(len(edges.ends)), 2))
+    return (swap[0] + edges.finest, swap[1] + edges.finest) if likely >= FOLLOWED else None
 
 
 def _check_waves(sample: Sample, stripes: Stripes, code: BinaryCode, collected: Collected, noise: NoiseModel) -> str | None:

@@ -15,7 +15,7 @@ from service.depth.base.epipolar import Contradiction, settled
 from service.depth.base.solution import DepthSolution
 from service.depth.base.triangulation_check import check_projector, missing_calibration
 from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, contradicted, doubt_coordinates, doubt_pixels, widen
-from service.depth.patterns.code_checks import check_codes
+from service.depth.patterns.code_checks import check_codes, check_inverted
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
@@ -186,7 +186,8 @@ def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, proje
              frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
     """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels and ramps are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
-    wrong = check_references(sample, codes.collected, noise) or check_order(sample, codes.collected, noise) or (
+    wrong = check_inverted(sample, codes.collected, noise) or check_references(sample, codes.collected, noise)
+    wrong = wrong or check_order(sample, codes.collected, noise) or (
         check_unevenness(sample, patterns, shown, noise, device) if projector is None
         else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)
