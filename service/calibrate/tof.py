@@ -12,6 +12,7 @@ from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.photometric.model.samples import evenly
 from kernels.tof.continuous.continuous import decode
+from kernels.tof.continuous.modulation import common_range_m
 from service.calibrate.results import digits, write_report
 from service.calibrate.solvers.tof_sweep import (
     Fit,
@@ -21,6 +22,7 @@ from service.calibrate.solvers.tof_sweep import (
     fit_steps,
     fit_wiggling,
     of_target,
+    part_at,
     target_faults,
     wiggling_sigma,
 )
@@ -31,6 +33,7 @@ from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture.capture import Capture
+from stage.capture.light import ContinuousWave
 from stage.errors import CalibrationError
 from stage.files import resolved
 from stage.spread import MAD_TO_SIGMA
@@ -58,6 +61,12 @@ MOST_WRONG = 0.2
 """Largest part of the steps that is left out."""
 LEAST_OFF_PLANE = 0.02
 """Part of the readings off the plane of the target from which on they are said; noise leaves a thousandth."""
+LEAST_SEEN = 0.03
+"""Least part of the pixels of a step at its distance that is a target: other things pass all distances by less."""
+MOST_REPEATS = 10
+"""Distances in ranges after which phases repeat beyond which pixels are at any distance by chance: they are in another unit."""
+FALLING = 0.8
+"""Length of the mean phasor of the sums of measured and true ranges from which on they are one sum; by chance 0.2 of 25 steps."""
 FEWEST = 5
 """Fewest steps of which one can contradict the others."""
 DETERMINED = 0.5
@@ -96,12 +105,12 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     kinds = {is_pulsed(capture) for capture in captures}
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
-    plain = _range_errors(plan, captures, None, device, timings)
-    pulsed = kinds == {True}
-    found = _fit_line(plan, captures, plain) if pulsed else _fit_wiggling(plan, captures, plain, device, timings)
+    measured = _range_errors(plan, captures, None, device, timings)
+    pulsed, plain = kinds == {True}, measured.errors
+    found = _fit_line(plan, captures, measured) if pulsed else _fit_wiggling(plan, captures, measured, device, timings)
     calibration = TofCalibration.model_validate({
         **found.known, "sigma_m": None if found.sigma_m is None else float(f"{found.sigma_m:.3g}")})
-    after = _range_errors(plan, captures, calibration, device, timings, told=found.warnings)
+    after = _range_errors(plan, captures, calibration, device, timings, told=found.warnings).errors
     used = np.isin(np.arange(len(captures)), found.left_out, invert=True)
     if plan.has_drift:
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
@@ -131,19 +140,54 @@ def _folder(sweep: Path, step: SweepDistance, allowed: Sequence[Path] | None) ->
     return found
 
 
+class _Measured(NamedTuple):
+    """Measured less true half paths of light, metres."""
+
+    errors: np.ndarray  # [steps] the median of each step
+    true: np.ndarray  # [steps] the median true half path of the same pixels
+    some: list[np.ndarray]  # of each step, of some of its pixels
+    repeat_m: float | None
+    """Range after which all phases repeat, so that errors are known but for multiples of it; None of pulses."""
+
+    @property
+    def falls(self) -> bool:
+        """Return whether the measured ranges fall by as much as the true ones grow."""
+        return self.repeat_m is not None and abs(np.exp(2j * np.pi / self.repeat_m * (self.errors + 2 * self.true)).mean()) > FALLING
+
+    def others(self, near_m: float) -> str:
+        """Return a sentence if less than half of most pictures lies where their distance says, and some of nearly each does, within
+        `near_m`; else nothing."""
+        if self.repeat_m is not None and np.median(self.true) > MOST_REPEATS * self.repeat_m:
+            return ""
+        part = part_at(self.some, near_m, self.repeat_m)
+        if (part >= LEAST_SEEN).mean() < 1 - MOST_WRONG or (part >= 0.5).mean() >= 1 - MOST_WRONG:
+            return ""
+        return (f"steps: {np.median(part):.0%} of the pixels of a step lie at its depth_m, and most of the others elsewhere: give each "
+                "capture a mask of the target alone, and check depth_m")
+
+
 def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings, *,
-                  told: tuple[str, ...] = ()) -> np.ndarray:
-    """Return [steps] the median of measured less true half path of light, metres. `told`: what is known to be wrong with the sweep."""
-    errors = []
+                  told: tuple[str, ...] = ()) -> _Measured:
+    """Return by how much measured half paths of light differ from true ones. `told`: what is known to be wrong with the sweep."""
+    errors, true, some, hz = list[float](), list[float](), list[np.ndarray](), set[float]()
     for step, capture in zip(plan.steps, captures, strict=True):
         solved = solve_tof(capture, TofOptions(), calibration=calibration, device=device, timings=timings)
         if not solved.solved.any() or solved.range_m is None:
             given = "" if calibration is None else " with the calibration that the distances give"
             raise RequestError(f"{capture.folder}: no pixel of this step is solved{given}: "
                                f"{'; '.join(told or solved.warnings) or 'check its frames and its mask'}")
-        off = _half_path(solved.range_m.astype(np.float64), capture) - _true_half_path(step, capture)
-        errors.append(float(np.median(off[solved.solved])))
-    return np.array(errors)
+        right = _true_half_path(step, capture)[solved.solved]
+        off = _half_path(solved.range_m.astype(np.float64), capture)[solved.solved] - right
+        errors.append(float(np.median(off)))
+        true.append(float(np.median(right)))
+        some.append(off[evenly(len(off), STEP_PIXELS)])
+        hz |= {frame.tof.modulation_hz for frame in capture.manifest.frames if isinstance(frame.tof, ContinuousWave)}
+    repeat_m = common_range_m(sorted(hz), SPEED_OF_LIGHT) if hz else None
+    found = np.array(errors)
+    if repeat_m is not None:  # a target beyond what the frequencies tell apart is as good as another
+        usual = float(np.angle(np.exp(2j * np.pi / repeat_m * found).sum())) / (2 * np.pi) * repeat_m
+        found -= repeat_m * np.round((found - usual) / repeat_m)
+    return _Measured(found, np.array(true), some, repeat_m)
 
 
 def _true_half_path(step: SweepDistance, capture: Capture) -> np.ndarray:
@@ -169,8 +213,9 @@ class _Found(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Found:
+def _fit_line(plan: Sweep, captures: list[Capture], found: _Measured) -> _Found:
     """Fit scale and offset to the median half paths of the steps, beside a drift with their temperatures."""
+    errors = found.errors
     true = np.array([float(np.median(_true_half_path(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
     measured = true + errors
@@ -191,8 +236,9 @@ def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Foun
                            "some distances again at another temperature")
     scale, offset = fit_line(ranges, depths)
     if abs(scale - 1) > MOST_SCALED:
-        raise RequestError(f"steps: depth_m grows by {scale:.3g} m for each metre of the measured ranges: check depth_m, its unit, the "
-                           "order of the captures, and their bin_s")
+        raise RequestError(found.others(MOST_SCALED * float(np.median(true))) or (
+            f"steps: depth_m grows by {scale:.3g} m for each metre of the measured ranges: check depth_m, its unit, the order of the "
+            "captures, and their bin_s"))
     middle, spread = float(measured[kept].mean()), float(ranges.std())
     entries = {"scale": scale, "offset_m": offset}
     freedom = len(kept) - (3 if plan.has_drift else 2)
@@ -208,8 +254,9 @@ def _fit_line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> _Foun
     return _Found(entries, sigma, left_out, warnings)
 
 
-def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, device: str, timings: Timings) -> _Found:
+def _fit_wiggling(plan: Sweep, captures: list[Capture], found: _Measured, device: str, timings: Timings) -> _Found:
     """Fit the harmonics of each frequency to the steps at the commonest temperature."""
+    errors = found.errors
     chosen = [number for number, step in enumerate(plan.steps) if step.temperature_c == plan.commonest_temperature_c]
     phases = _phases(plan, captures, chosen, device, timings)
     if not phases:
@@ -217,12 +264,12 @@ def _fit_wiggling(plan: Sweep, captures: list[Capture], errors: np.ndarray, devi
     highest = max(phases)  # the surest, on which ranges rest
     per_radian = SPEED_OF_LIGHT / (4 * np.pi * highest)
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(errors - np.median(errors))))
-    if scatter > MOST_SCATTER * 2 * np.pi * per_radian:
-        depths = np.array([step.depth_m for step in plan.steps])
+    most = MOST_SCATTER * 2 * np.pi * per_radian
+    if scatter > most:
         falls = ", and reference_phase_rad of the frames (--signal of relit import tof), for the ranges fall where depth_m grows"
-        raise RequestError(f"steps: measured ranges differ from the declared distances by {scatter:.2g} m more at some than at others, "
-                           "which is no wiggling: check depth_m, its unit, and the order of the captures"
-                           f"{falls if depths @ (depths + errors - (depths + errors).mean()) < 0 else ''}")
+        raise RequestError(found.others(most) or (
+            f"steps: measured ranges differ from the declared distances by {scatter:.2g} m more at some than at others, which is no "
+            f"wiggling: check depth_m, its unit, and the order of the captures{falls if found.falls else ''}"))
 
     def some(hz: float, steps: Iterable[int]) -> list[StepPhases]:
         return [phases[hz][step] for step in steps if step in phases[hz]]

@@ -115,6 +115,18 @@ def of_target(steps: Mapping[int, StepPhases], modulation_hz: float) -> dict[int
     return found
 
 
+def part_at(off_m: Sequence[np.ndarray], near_m: float, repeat_m: float | None) -> np.ndarray:
+    """Return the part of each step's readings that is off by one length in all steps, within `near_m`, [steps]: the length that most steps
+    have. `off_m`: [n] metres of each step; `repeat_m`: what they repeat after; None: nothing."""
+    every = np.concatenate(off_m)
+    span = np.ptp(every) + 2 * near_m if repeat_m is None else repeat_m
+    count = max(int(np.ceil(2 * span / near_m)), 1)
+    places = [((off - every.min()) % span / span * count).astype(int) % count for off in off_m]
+    parts = np.array([np.bincount(place, minlength=count) / len(place) for place in places])
+    wide = np.sum([np.roll(parts, shift, axis=1) for shift in range(-2, 3)], axis=0) if count >= 5 else parts
+    return np.asarray(wide[:, int(np.minimum(wide, 0.5).mean(axis=0).argmax())])
+
+
 class WigglingSigma(NamedTuple):
     """How far ranges are known from the nearest to the farthest distance of a sweep, and over the rest of a period of its highest
     frequency."""

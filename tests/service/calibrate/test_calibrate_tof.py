@@ -94,6 +94,50 @@ def test_what_stands_before_the_target_is_left_out_and_said(tmp_path):
         calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
 
 
+def before_a_wall(depth_m: float, columns: int) -> tof.View:
+    """A target over some columns of the picture, before a wall at 8 m that is turned by 17 degrees."""
+    target, behind = wall(depth_m), wall(8.0, turn=0.3)
+    return target._replace(distance=np.where(np.arange(COLS) < columns, target.distance, behind.distance))
+
+
+@pytest.mark.parametrize("pulsed", [False, True], ids=["cw", "pulsed"])
+def test_a_target_of_less_than_half_of_the_picture_is_said(pulsed, tmp_path):
+    """The ranges of the wall were held against the distances of the target, and depth_m was blamed."""
+    def written(columns, depths, declared):
+        steps = [{"capture": f"d{columns}-{k}", "depth_m": float(depth)} for k, depth in enumerate(declared)]
+        for step, depth in zip(steps, depths, strict=True):
+            view = before_a_wall(depth, columns)
+            write(tmp_path / step["capture"], pulsed_frames(tof.histogram(view, 1e6, seed=0)) if pulsed else cw(view), camera=CAMERA)
+        (tmp_path / "sweep.json").write_text(json.dumps({"schema": "relit.tof-sweep/1", "steps": steps}))
+        return TofCalibrationRequest(sweep=tmp_path / "sweep.json", out=tmp_path / "c.json", device="cpu")
+
+    depths = np.linspace(0.8, 6.5, 9)
+    with pytest.raises(RequestError, match=r"31% of the pixels of a step lie at its depth_m.*mask of the target alone"):
+        calibrate_tof(written(5, depths, depths))
+    with pytest.raises(RequestError, match="depth_m, its unit"):
+        calibrate_tof(written(COLS, depths, 100 * depths))
+
+
+@pytest.mark.long
+def test_targets_beyond_what_one_frequency_tells_apart_calibrate_it(tmp_path):
+    """60 MHz repeat after 2.5 m; the distances were called no wiggling, and depth_m was blamed."""
+    settings = tof.even((60e6,), 4)
+
+    def frames(view):
+        return cw_frames(tof.correlations(view, 1e6, settings, seed=1, harmonics=WAVES), settings)
+
+    path = sweep(tmp_path, [(f"d{k}", depth, 0.04, None) for k, depth in enumerate(np.linspace(0.4, 6.0, 25))], frames)
+    made = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
+    assert made.steps == 25 and not made.warnings and made.calibration.sigma_m < 1e-3
+    _, maps, _ = run(write(tmp_path / "new", frames(wall(1.7, 0.04)), camera=CAMERA), calibration=tmp_path / "c.json")
+    assert abs(np.median(maps.depth[maps.mask]) - 1.7) < 1e-3
+    plan = json.loads(path.read_text())
+    plan["steps"] = [{**step, "depth_m": 1000 * step["depth_m"]} for step in plan["steps"]]
+    path.write_text(json.dumps(plan))
+    with pytest.raises(RequestError, match="check depth_m, its unit"):
+        calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
+
+
 @pytest.mark.long
 def test_distances_in_another_unit_or_scale_are_told(tmp_path, relit):
     steps = [(f"d{k}", depth, 0.0, None) for k, depth in enumerate(np.linspace(0.8, 7.5, 25))]
