@@ -20,7 +20,7 @@ from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
-from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, place_scans, reach_of, readings_of
+from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, elsewhere, place_scans, reach_of, readings_of
 from service.scans.fusion.other_readings import LEAST_SCANS, common_scale, meant_otherwise
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
@@ -30,6 +30,8 @@ from service.sharing.sharing import digest, kind_of_worker
 from stage.formats.npy import packed, unpacked
 from stage.sets.scan_set import read_scan_set
 
+SAID_PAIRS = 3
+"""Pairs of scans that contradict each other that are said, the worst first."""
 MOST_STEP = 0.1
 """Voxels between neighbouring floats of 32 bits where the scans are, in which the mesh is written: a vertex is good to some hundredths of
 a voxel."""
@@ -103,7 +105,8 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
 
     readings = read("compare", samples, lambda _, scan: scan)
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
-    warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
+    scan_names = [summary.name for summary in summaries]
+    warnings = [*placing_warnings(scan_names, placings, request.misplaced), *_pair_warnings(scan_names, elsewhere(samples, readings).pairs)]
     words, poses = None, scans.poses()
     if poses is not None and (meant := meant_otherwise(samples, readings, poses, lambda at, moved: read("otherwise", at, moved.scan))):
         words = f"scans[].scan_to_world: {meant}"
@@ -152,7 +155,7 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
 
 def _scale_that_fits(summaries: list[ScanSummary], placings: list[Placing], readings: list[Readings], voxel: float) -> float | None:
     """Return the factor of all depths at which no scan is misplaced, where several are; None: there is none."""
-    if len(summaries) < LEAST_SCANS or sum(placing.misplaced for placing in placings) < 2:
+    if len(summaries) < LEAST_SCANS or sum(placing.misplaced and not placing.through for placing in placings) < 2:
         return None
     samples = [summary.sample for summary in summaries]
     scanners = np.array([np.linalg.inv(summary.camera_from_world)[:3, 3] for summary in summaries])
@@ -171,7 +174,10 @@ def placing_warnings(names: list[str], placings: list[Placing], choice: Misplace
     end = "was left out" if choice is Misplaced.LEAVE_OUT else "was fused all the same, and the surface is doubled there"
     for name, placing in zip(names, placings, strict=True):
         others = " and ".join(names[other] for other in placing.against)
-        if placing.misplaced:
+        if placing.through:
+            yield (f"scan {name}: it has surface where several other scans saw through, or they where it did (up to "
+                   f"{placing.through:.0%} of the points of two scans): its pose is wrong, and it {end}")
+        elif placing.misplaced:
             yield (f"scan {name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of {others or 'the others'}, whose noise "
                    f"explains {1e3 * placing.sigma_m:.2g} mm: " + (
                        f"one of their poses is wrong, no other scan tells which, and each {end}" if others else
@@ -179,6 +185,13 @@ def placing_warnings(names: list[str], placings: list[Placing], choice: Misplace
         elif placing.compared < LEAST_COMMON and len(names) > 1:
             rest = "those that remain" if any(each.misplaced for each in placings) else "the others"
             yield f"scan {name}: has next to no surface in common with {rest}, so that nothing tells whether its pose is right"
+
+
+def _pair_warnings(names: list[str], pairs: list[tuple[int, int, float]]) -> Iterator[str]:
+    """Yield which scans contradict each other where nothing tells which of them lies elsewhere."""
+    for one, two, part in sorted(pairs, key=lambda pair: -pair[2])[:SAID_PAIRS]:
+        yield (f"scans {names[one]} and {names[two]}: {part:.0%} of the points that both see lie where the other of them saw through: one "
+               "of their poses is wrong, or what they see has moved")
 
 
 def packed_brick(surface: BrickSurface) -> bytes:

@@ -1,4 +1,4 @@
-"""Scans that lie beside the surface of the others by more than their noise explains: their poses are wrong."""
+"""Scans that lie beside the surface of the others by more than their noise explains, or where others saw through: their poses are wrong."""
 
 from typing import NamedTuple
 
@@ -23,6 +23,10 @@ LARGEST_SIGMAS = 2.0
 CONFIRMED = 0.25
 """Part of the displacement of a misplaced scan up to which others confirm the place of another one. Right scans lie beside each other by
 about a third of their noise (0.16 to 0.4 mm where that is 0.6 to 0.8 mm), a sixth of the least displacement that counts."""
+CONTRADICTED, LEAST_THROUGH, AGAINST = 0.1, 15, 2
+"""Part of the points of two scans, of those that lie on the other's surface or where it saw through, and their number, from which on the
+two contradict each other (of right poses none do, of one that is turned by 90° 10 to 40 %), and fewest scans that must contradict one
+whose pose is wrong."""
 UNDETERMINED = 1e-10
 """Directions in which a motion is determined less than this part of the best determined one do not move."""
 ROUNDS = 5
@@ -38,6 +42,7 @@ class Placing(NamedTuple):
     sigma_m: float  # median standard deviation of that distance
     misplaced: bool
     against: tuple[int, ...] = ()  # scans that it contradicts, where no other scan tells whose pose is wrong
+    through: float = 0.0  # largest part of the points of it and another scan that were seen through, if that is why; else 0
 
 
 class Sample(NamedTuple):
@@ -54,6 +59,7 @@ class Readings(NamedTuple):
     at: np.ndarray  # [k] int64
     distance: np.ndarray  # [k] float32 metres, from the surface of the scan
     expected: np.ndarray  # [k] float32 metres, standard deviation of that
+    through: np.ndarray = np.empty(0, np.int64)  # [m], the points that it saw through: what it measured lies far behind them
 
 
 def sample_of(scan: PreparedScan, number: int) -> Sample:
@@ -90,7 +96,19 @@ def readings_of(scan: PreparedScan, number: int, samples: list[Sample], reach: f
     first = sum(len(sample.points) for sample in samples[:number])
     expected[first:first + len(samples[number].points)] = 0
     at = np.flatnonzero(expected)
-    return Readings(at, distance[at], expected[at])
+    return Readings(at, distance[at], expected[at], np.flatnonzero(_seen_through(scan, whole.points, reach)))
+
+
+def _seen_through(scan: PreparedScan, points: np.ndarray, reach: float) -> np.ndarray:
+    """Return [n] bool, the points (metres, world) that lie before all that a scan measured around their line of sight, by `reach`."""
+    image = scan.image
+    there = points @ image.camera_from_world[:3, :3].T + image.camera_from_world[:3, 3]
+    front = there[:, 2] < 0
+    u, v = scan.camera.image_coordinates(np.where(front[:, None], there, [0.0, 0.0, -1.0]))
+    rows, cols = image.clear.shape
+    col, row = (np.clip(np.floor(np.nan_to_num(at)), -1, side).astype(np.int64) for at, side in ((u, cols), (v, rows)))
+    inside = front & (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
+    return inside & (-there[:, 2] < np.asarray(image.clear)[np.where(inside, row, 0), np.where(inside, col, 0)] - reach)
 
 
 def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -> list[Placing]:
@@ -129,8 +147,9 @@ def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -
         return {worst: placings[worst]._replace(against=tuple(rivals))} | {
             other: beside[other]._replace(against=(worst,)) for other in rivals}
 
-    out: dict[int, Placing] = {}
-    placings = [placing(number, set()) for number in range(len(samples))]
+    out = {number: placing(number, set())._replace(misplaced=True, through=part)
+           for number, part in elsewhere(samples, readings).scans.items()}
+    placings = [placing(number, set(out)) for number in range(len(samples))]
     while True:
         wrong = [number for number, each in enumerate(placings) if each.misplaced and number not in out]
         if not wrong:
@@ -140,6 +159,33 @@ def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -
         for number in everyone - set(out):
             if any(ranges[other][number + 1] > ranges[other][number] for other in found):
                 placings[number] = placing(number, set(out))
+
+
+class Elsewhere(NamedTuple):
+    """Scans of which others saw through parts."""
+
+    scans: dict[int, float]
+    """Those that several others contradict, which contradict few themselves, with the largest part of the points of two."""
+    pairs: list[tuple[int, int, float]]
+    """The others that contradict each other, with the part of their points."""
+
+
+def elsewhere(samples: list[Sample], readings: list[Readings]) -> Elsewhere:
+    """Return the scans whose poses are wrong by what others saw through, the worst first: each is compared with those that remain."""
+    firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
+    through, common = (np.stack([np.diff(np.searchsorted(getattr(each, name), firsts)) for each in readings]) for name in ("through", "at"))
+    through, common = through + through.T, common + common.T  # [scans, scans] points of both
+    part = through / np.maximum(through + common, 1)
+    against = (part > CONTRADICTED) & (through >= LEAST_THROUGH)
+    scans: dict[int, float] = {}
+    while True:
+        count = against.sum(axis=1)
+        worst = int(np.lexsort((through.sum(axis=1), count))[-1])
+        if count[worst] < AGAINST or 2 * np.median(count[against[worst]]) > count[worst]:
+            pairs = zip(*np.nonzero(np.triu(against)), strict=True)
+            return Elsewhere(scans, [(int(one), int(two), float(part[one, two])) for one, two in pairs])
+        scans[worst] = float(part[worst, against[worst]].max())
+        against[worst] = against[:, worst] = False
 
 
 def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, apart: set[int], voxel: float) -> Placing:

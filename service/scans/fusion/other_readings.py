@@ -55,10 +55,18 @@ def _w_first(pose: np.ndarray) -> np.ndarray:
     return np.asarray(camera @ OPENCV)
 
 
+def _millimetres(pose: np.ndarray) -> np.ndarray:
+    """Return a pose whose translation is in millimetres."""
+    return np.asarray(np.column_stack([pose[:, :3], np.append(pose[:3, 3] / 1000, 1.0)]))
+
+
 OTHERWISE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "the poses are world_to_scan": np.linalg.inv,
     "the poses that were imported are world_to_camera": lambda pose: np.asarray(OPENCV @ np.linalg.inv(pose) @ OPENCV),
     "the quaternions of the poses that were imported begin with w": _w_first,
+    "the y and z axes of the scans are negated (OpenCV's axes in scan_to_world, or OpenGL's in poses that were imported)":
+        lambda pose: np.asarray(pose @ OPENCV),
+    "the translations of the poses are in millimetres": _millimetres,
 }
 """How poses, world from scan [4, 4], may have been meant."""
 
@@ -89,14 +97,18 @@ def meant_otherwise(samples: list[Sample], readings: list[Readings], poses: list
     given = agreement(samples, readings)
     if len(poses) < 2 or given.contradicting <= DOUBTFUL:
         return None
+    fitting: list[tuple[float, int, str, Agreement]] = []
     for words, other in OTHERWISE.items():
         moved = Moved(poses, [other(pose) for pose in poses])
         there = [moved.sample(number, sample) for number, sample in enumerate(samples)]
         found = agreement(there, read(there, moved))
         if found.contradicting <= FAR_BETTER * given.contradicting and found.agreeing >= given.agreeing + LEAST_COMMON:
-            return (f"{words}: read so, {found.agreeing} points of scans lie on other scans and {found.common - found.agreeing} beside "
-                    f"them, and {given.agreeing} and {given.common - given.agreeing} as they are: write them as scan_to_world")
-    return None
+            fitting.append((found.contradicting, len(fitting), words, found))
+    if not fitting:
+        return None
+    _, _, words, found = min(fitting)
+    return (f"{words}: read so, {found.agreeing} points of scans lie on other scans and {found.common - found.agreeing} beside "
+            f"them, and {given.agreeing} and {given.common - given.agreeing} as they are: write them as scan_to_world")
 
 
 def common_scale(samples: list[Sample], readings: list[Readings], scanners: np.ndarray) -> tuple[float, list[Readings]]:
@@ -113,5 +125,5 @@ def common_scale(samples: list[Sample], readings: list[Readings], scanners: np.n
         rest = np.abs(distance + growth * along)
         weight = along / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)
         growth = -float(weight @ distance) / max(float(weight @ along), 1e-12)
-    return 1 + growth, [each._replace(distance=(each.distance + growth * part).astype(np.float32))
+    return 1 + growth, [each._replace(distance=(each.distance + growth * part).astype(np.float32), through=each.through[:0])
                         for each, part in zip(readings, towards, strict=True)]

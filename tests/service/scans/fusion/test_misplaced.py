@@ -100,6 +100,21 @@ def test_scans_of_another_scale_than_their_poses_are_named_so(tmp_path):
         fuse_scans(write_scans(tmp_path, shots), tmp_path / "out")
 
 
+@pytest.mark.parametrize(("count", "left_out"), [(12, True), (9, False)])
+def test_a_scan_that_is_turned_by_90_degrees_is_told_by_what_others_saw_through(tmp_path, count, left_out):
+    """Its surface lies near that of others only where it agrees with them by chance: it was fused with them, without a word. Where one
+    other alone saw through it, nothing tells which of the two is wrong."""
+    shots = turntable(count, (96, 72), range_m=2.0)
+    poses, turn = [shot.world_from_camera for shot in shots], np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    turned = 3 if left_out else 2
+    found = fuse_scans(write_scans(tmp_path, shots, poses=[turn @ pose if number == turned else pose for number, pose in enumerate(poses)]),
+                       tmp_path / "out")
+    assert [scan["fused"] for scan in found.facts["scans"]] == [number != turned or not left_out for number in range(count)]
+    words = "several other scans saw through" if left_out else "one of their poses is wrong, or what they see has moved"
+    assert f"view {turned}" in found.warnings[0] and words in found.warnings[0]
+
+
 def arc(folder, poses=None):
     """Three scans of the statue, 20 degrees apart, in the world frame of the first."""
     shots = [shoot(place(np.radians(angle), 0.1, 2.0), (80, 60), 130.0, seed=angle) for angle in (0, 20, 40)]
@@ -120,7 +135,9 @@ def test_inverted_poses_are_named_so(tmp_path, moved_m):
 
 @pytest.mark.parametrize(("written", "words"), [
     (np.linalg.inv, "that were imported are world_to_camera"),
-    (lambda pose: with_quaternion(pose, np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)), "begin with w")])
+    (lambda pose: with_quaternion(pose, np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)), "begin with w"),
+    (lambda pose: pose @ np.diag([1.0, -1, -1, 1]), "the y and z axes of the scans are negated"),
+    (lambda pose: np.vstack([pose[:3] * [1, 1, 1, 1000], pose[3:]]), "translations of the poses are in millimetres")])
 def test_poses_of_imported_frames_that_mean_something_else_are_named(tmp_path, written, words):
     """Files of depth cameras have poses in the axes of OpenCV, y down and z forwards."""
     axes = np.diag([1.0, -1, -1, 1])
