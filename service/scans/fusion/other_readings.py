@@ -55,18 +55,12 @@ def _w_first(pose: np.ndarray) -> np.ndarray:
     return np.asarray(camera @ OPENCV)
 
 
-def _millimetres(pose: np.ndarray) -> np.ndarray:
-    """Return a pose whose translation is in millimetres."""
-    return np.asarray(np.column_stack([pose[:, :3], np.append(pose[:3, 3] / 1000, 1.0)]))
-
-
 OTHERWISE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "the poses are world_to_scan": np.linalg.inv,
     "the poses that were imported are world_to_camera": lambda pose: np.asarray(OPENCV @ np.linalg.inv(pose) @ OPENCV),
     "the quaternions of the poses that were imported begin with w": _w_first,
     "the y and z axes of the scans are negated (OpenCV's axes in scan_to_world, or OpenGL's in poses that were imported)":
         lambda pose: np.asarray(pose @ OPENCV),
-    "the translations of the poses are in millimetres": _millimetres,
 }
 """How poses, world from scan [4, 4], may have been meant."""
 
