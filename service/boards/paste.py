@@ -208,6 +208,7 @@ def _measure(whole: HeightMap, box: tuple[slice, slice], own: np.ndarray, pad: P
     edge, size = levels_m[0], pad.area_m2 / square
     fine = zoom(np.where(own, smooth, 0.0), FINE, order=1, mode="nearest", grid_mode=True) > edge
     count = fine.sum() / FINE**2
+    nominal = _outlined(part.grid, box, own, pad)
     doubt = np.where(own, ndtr((smooth - edge) / np.sqrt(variance)), 0)
     doubt = doubt * (1 - doubt)
     step = max(float(np.median(shared[own])), 0.02 * stencil_m)
@@ -222,7 +223,7 @@ def _measure(whole: HeightMap, box: tuple[slice, slice], own: np.ndarray, pad: P
                               outline / tall * max(mean - edge, 0.0) if count else 0.0,
                               by_shifts(np.where(top, height - mean, 0), own) / tall)
     values = {"volume_percent": Measured(volume / full, volume_sigma / full),
-              "area_percent": Measured(float(count / size), float(area_sigma / size)),
+              "area_percent": Measured(float(count / nominal), float(area_sigma / nominal)),
               "height_percent": Measured(mean / stencil_m, height_sigma / stencil_m)}
     offset, spread = np.full(2, np.nan), np.full(2, np.nan)
     if count:
@@ -235,6 +236,14 @@ def _measure(whole: HeightMap, box: tuple[slice, slice], own: np.ndarray, pad: P
     seen = min(known.sum() / own.sum(), (known & opening).sum() / size)
     return PadPaste(float(seen), volume,
                     {name: Measured(100 * each.value, 100 * each.sigma) for name, each in values.items()}, offset, spread)
+
+
+def _outlined(grid: BoardGrid, box: tuple[slice, slice], own: np.ndarray, pad: Pad) -> float:
+    """Return the area of an opening, pixels, as the outline of paste that fills it is read: medians and interpolation round its corners."""
+    row, col = ((np.arange(FINE * (side.stop - side.start)) + 0.5) / FINE - 0.5 + side.start for side in box)
+    filled = pad.holds(*grid.coordinates(*np.meshgrid(row, col, indexing="ij"))).reshape(len(own), FINE, -1, FINE).mean(axis=(1, 3))
+    read = zoom(np.where(own, median_filter(filled, 3), 0.0), FINE, order=1, mode="nearest", grid_mode=True) > 0.5
+    return float(read.sum() / FINE**2) or pad.area_m2 / grid.pixel_m**2
 
 
 def _bridges(level: HeightMap, openings: np.ndarray, least_m: float) -> list[tuple[int, ...]]:
