@@ -76,6 +76,7 @@ def test_correlation_images_have_both_signs(tmp_path):
     found = inspect(InfoRequest(capture=correlation_images(tmp_path, images, saturation=99.0)))
     facts, values = dict(found.facts), np.stack(images)
     assert found.faults == []
+    assert facts["camera"].endswith("depths in metres")
     assert facts["recorded"] == f"{values.min():.4g} to {values.max():.4g}: correlation images have both signs"
     assert facts["saturated"] == f"{(values >= 99).sum()} readings at or above 99" and "brightest" not in facts
     images[2][0, :3] = np.nan  # as the solver takes them
