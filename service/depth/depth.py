@@ -185,7 +185,8 @@ def _check_plausible(solution: DepthSolution, capture: Capture, request: DepthRe
                                 f"{'; '.join(solution.warnings) or _advice(counts, using)}")
         solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
                                  "--least-confidence 0 counts unsure ones as solved")
-    middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths
+    middle = float(np.median(solution.depth[estimated]))
+    field = KINDS[using].lengths if request.beside is None else "camera.world_from_camera"
     if field is not None and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
         raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
 

@@ -1,5 +1,7 @@
 """Doubts that only the whole image raises: pixels that contradict their neighbours, other points or the epipolar geometry."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.ndimage import uniform_filter
 
@@ -104,7 +106,7 @@ def _doubt_around(right: np.ndarray, status: np.ndarray) -> np.ndarray:
 
 
 def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask: np.ndarray, request: DepthRequest,
-             warnings: list[str]) -> None:
+             warnings: list[str], advice: Mapping[Status, str] = ADVICE) -> None:
     """Say what does not fit on the whole scene, and let confidence and status follow.
 
     Args:
@@ -112,6 +114,7 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
         right: of `doubt_pixels` or `doubt_coordinates`.
         request: where it names a least confidence, that alone decides what counts as solved.
         warnings: what a sample has shown of the frames; where frames are declared wrongly, no depth is believed.
+        advice: the most frequent cause of each status, and what to do about it.
     """
     lit = mask & ~np.isin(solution.status, UNLIT)
     if request.near_m is not None or request.far_m is not None:
@@ -126,7 +129,7 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
         most = Status(int(np.bincount(refused).argmax()))
         what = "depth" if isinstance(solution, DepthSolution) else "place in the projector"
         warnings = [*warnings, f"frames: {100 * share:.2g} % of the {int(lit.sum())} lit pixels have a {what} that can be trusted; "
-                               f"most of the others are {most.name.lower().replace('_', ' ')}: {ADVICE[most]}"]
+                               f"most of the others are {most.name.lower().replace('_', ' ')}: {advice[most]}"]
     confidence = solution.confidence_map()
     assert confidence is not None  # it follows from sigma
     solution.confidence = (right * min(1.0, share / SURE_SHARE) * confidence).astype(np.float32)

@@ -40,6 +40,8 @@ UNEVEN, LARGEST_STEP = 0.01, 0.05
 that pixels which are farther apart count with."""
 MOST_BRIGHTER = 0.9
 """Part of the lit pixels at which black is brighter than white, from which on the two are named as exchanged."""
+WHITE_PART = 0.8
+"""Least part of the way from the darkest to the brightest reading of a pixel at which white lies: blur dims patterns, and not white."""
 AXES: tuple[Axis, Axis] = ("column", "row")
 NOT_LIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
 """Statuses of pixels that cannot tell whether the frames are declared rightly."""
@@ -199,11 +201,13 @@ def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], boo
 
 
 def check_references(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
-    """Return a sentence if black is brighter than white at most of the pixels that differ."""
+    """Return a sentence if the frame of black is as bright as any and that of white as dark as any, at most of the pixels that any frame
+    lights: of images that are a frame late one of the two shows a pattern."""
     if collected.white is None or collected.black is None:
         return None
-    even = sample.grey[[collected.white, collected.black]]
-    brighter = (even[1] > even[0])[sample.lit(even, noise)]
+    low, top = sample.grey.min(axis=0), sample.grey.max(axis=0)
+    white, black = ((sample.grey[number] - low) / np.maximum(top - low, 1e-12) for number in (collected.white, collected.black))
+    brighter = ((black > WHITE_PART) & (white < 1 - WHITE_PART))[sample.lit(sample.grey, noise)]
     if len(brighter) < ENOUGH or brighter.mean() < MOST_BRIGHTER:
         return None
     return (f"frames: black is brighter than white at {100 * brighter.mean():.0f} % of the lit pixels: exchange the images of the frames "
@@ -214,7 +218,8 @@ def check_declaration(sample: Sample, patterns: list[Pattern], projector: Patter
                       device: str) -> str | None:
     """Return a sentence if the frames make much more sense when they are understood in another way than the manifest declares."""
     share, expected = agreement(sample, patterns, projector, model, noise, device)
-    if not share < min(DOUBTFUL_SHARE, NOISY_PART * expected):
+    share = 0.0 if np.isnan(share) else share  # no pixel has signal as declared, as where black and white show patterns
+    if share >= min(DOUBTFUL_SHARE, NOISY_PART * expected):
         return None
     readings = _other_readings(patterns, lambda other, mirrored: agreement(sample, other, projector, model, noise, device,
                                                                            mirrored=mirrored).share)

@@ -68,7 +68,7 @@ def sentence(name: str, found: Contradiction, given: Projector) -> str:
     `name`: the field of the camera and its name. `given`: the camera as it was given."""
     if not found.plausible:
         return (f"{name}: where both cameras see the same places contradicts its calibration by more than a camera can be off: images that "
-                "are mirrored, upside down or of another camera do that, and a camera_from_other that is the inverse of the pose; no depth "
+                "are mirrored, upside down or of another camera do that, and a pose that is the inverse of the right one; no depth "
                 "of it is trusted")
     seen = f"{name}: the places that both cameras see contradict its calibration"
     if given is not found.declared:

@@ -20,7 +20,7 @@ from kernels.structured.triangulate import triangulate
 from service.depth.base.epipolar import Contradiction, contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective, check_projector
-from service.depth.patterns.agreement import conclude, doubt_pixels
+from service.depth.patterns.agreement import ADVICE, conclude, doubt_pixels
 from service.depth.patterns.coordinates import DecodedSolution
 from service.depth.patterns.patterns import projector_model, solve_patterns
 from service.depth.stereo.camera_doubts import LEAST_PX, TURNED, as_projector, sentence, widened
@@ -33,6 +33,9 @@ from stage.capture.manifest import FILE_NAME
 from stage.capture.projector import Projector, UncalibratedProjector
 from stage.errors import ManifestError
 
+POSES = {Status.OUT_OF_RANGE: "the places that both cameras see and the poses contradict each other: check camera.world_from_camera of "
+                              "both captures (metres, y up, z towards the camera) and camera.focal_px"}
+"""What is said of two cameras in place of a projector."""
 REACH = 2
 """The window of the planes is this many pixels to every side: stripes as wide as a few pixels have slopes there too."""
 STEP_TIMES = 4.0
@@ -71,10 +74,11 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         check_perspective(each)
     given = _second_camera(capture, other)
     plain = request.model_copy(update={"near_m": None, "far_m": None, "max_sigma": None, "normals": False, "refine_projector": False})
-    images = []
+    images, warnings = [], list[str]()
     for each, inside in ((capture, mask), (other, other.mask())):
         found = solve_patterns(_uncalibrated(each), inside, plain, device, timings)
         assert isinstance(found, DecodedSolution)
+        warnings += [f"{each.folder / FILE_NAME}: {words}" for words in found.warnings[1:]]  # the first: that depth is not asked for
         columns, rows = found.coordinates.columns, found.coordinates.rows
         if columns is None or rows is None:
             raise RequestError(f"--beside: {each.folder} has a code of one axis alone: two cameras need columns and rows to find the "
@@ -102,7 +106,6 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
     told = {"capture": str(beside), "matched": int(places.found.sum()), "residual_px": statistics(residual[solution.solved])}
     solution.facts = {**own.facts, "beside": told}
     solution.facts.pop("decoded_only", None)
-    warnings = []
     if contradicted is not None:
         assert solution.sigma is not None
         solution.sigma = widened(solution.depth, solution.sigma, capture.camera, contradicted, given)
@@ -113,7 +116,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
             told["refined"] = view_facts(view, "world_from_camera", pose.tolist())
         if not contradicted.plausible and request.least_confidence is None:
             solution.status[solution.solved] = Status.UNSURE
-    conclude(solution, doubt_pixels(solution, residual, capture.camera, view, device), mask, request, warnings)
+    conclude(solution, doubt_pixels(solution, residual, capture.camera, view, device), mask, request, warnings, ADVICE | POSES)
     return solution
 
 

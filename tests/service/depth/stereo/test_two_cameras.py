@@ -1,6 +1,7 @@
 """Two cameras under one projector that nobody has calibrated: depth by the cameras alone, where both see the same place of it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -125,6 +126,14 @@ def test_what_is_missing_is_named(relit, tmp_path):
     kept = [frame for frame in json.loads(good)["frames"] if frame["pattern"].get("axis") != "row"]
     edit_manifest(tmp_path / "second", frames=kept)
     assert "second has a code of one axis alone: two cameras need" in relit.refused(*command)
+    frames = json.loads(good)["frames"]
+    edit_manifest(tmp_path / "second", frames=[{**frame, "pattern": next_one["pattern"]}
+                                               for frame, next_one in zip(frames, [*frames[1:], frames[0]], strict=True)])
+    assert re.search(r"second/capture\.json: frames: .* if the images are one frame (late|early)", relit.refused(*command))
+    second.write_text(good)
+    axes = np.diag([1.0, -1, -1, 1])  # of OpenCV
+    edit_manifest(tmp_path / "second", camera={**camera, "world_from_camera": (axes @ PLACE @ axes).tolist()})
+    assert "check camera.world_from_camera of both captures" in relit.refused(*command)
     assert not (tmp_path / "out").exists()
 
 
