@@ -28,10 +28,11 @@ from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
 from stage.capture.sequence import SEQUENCE_FILE, Sequence, TimeStep, read_sequence
 from stage.colour.colour import convert
-from stage.colour.environment_maps import check_environment, outside_sentences
+from stage.colour.environment_maps import check_environment, multiplied_sentences, outside_sentences
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError
 from stage.folders import advice
+from stage.formats.images import read_header
 from stage.formats.ply import POINTS_FILE, PointCloud, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.maps import MAPS_FILE, SurfaceMaps
@@ -110,7 +111,10 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
         report = writer.surface(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version,
                                 textures=request.textures, **more)
     warnings = [*repairs, *clipping_sentences({**(around.clipped or {}), **(around.rig.clipped if around.rig is not None else {})}),
-                *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"), *report.warnings]
+                *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"),
+                *(around.encodings or {}).values(), *report.warnings]
+    if around.environment is not None:
+        warnings += multiplied_sentences({around.environment.name: read_header(around.environment).multiplied})
     if (plain := _plain(maps)) is not None:
         warnings.append(plain)
     if around.rig is not None and (doubt := other_manifest(maps, around.rig, path)) is not None:
@@ -181,7 +185,7 @@ def _open_surroundings(request: ExportRequest, maps: SurfaceMaps) -> Surrounding
     if request.environment is not None:
         check_environment(request.environment)
     card = None if request.card is None else find_frames(request.card, camera)
-    return Surroundings(rig, request.environment, card, {} if request.clip_negative else None, {})
+    return Surroundings(rig, request.environment, card, {} if request.clip_negative else None, {}, {})
 
 
 def _content_hashes(surroundings: Surroundings) -> dict[str, str]:

@@ -22,6 +22,7 @@ from service.viewing.view_files import result_file
 from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
 from stage.files import replacing_folder, write_text
+from stage.results.maps import SurfaceMaps
 
 PUBLICATION_FILE, SCHEMA = "publication.json", "relit.publication/1"
 """The file by which a folder is known as one that this command has made."""
@@ -61,6 +62,8 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
     maps = None if request.maps is None else ResultLayers(result_file(request.maps), source.capture)
     if maps is not None and maps.of_depth:
         raise RequestError(f"--maps {request.maps}: holds a depth: give a folder with maps.exr")
+    if maps is not None:
+        SurfaceMaps.read(maps.path, layers=("normal", "height", "part"))  # which refuses normals of another frame
     doubt = None if maps is None else other_inputs(maps.provenance, source.stack.key, maps.path)
     front = np.flatnonzero(source.lights.direction[:, 2] > 0)
     if len(front) < LEAST_LIGHTS:

@@ -59,7 +59,7 @@ class Environments:
         self.outside: dict[str, float] = {}
         """The part of the light that colours outside of the working space gain, by the names of the maps that were read so far."""
         self._full: dict[str, float] = {}
-        self._eight_bit: dict[str, str] = {}
+        self._encodings: dict[str, str] = {}
         self._multiplied: dict[str, float] = {}
         self._rows: dict[str, int] = {}
         self._digests: dict[Path, str] = {}
@@ -82,7 +82,7 @@ class Environments:
         """Return one environment map in a working space; the last one that was read is kept."""
         if self._last is None or self._last[:2] != (path, space):
             radiance = read_environment(path, space, clipped=self.clipped, outside=self.outside, full=self._full,
-                                        eight_bit=self._eight_bit)
+                                        encodings=self._encodings)
             self._last = (path, space, EnvironmentMap(radiance))
             self._multiplied[path.name] = read_header(path).multiplied
             self._rows[path.name] = len(self._last[2].radiance)
@@ -92,7 +92,7 @@ class Environments:
         """Return a sentence for each thing that makes the light of the maps that were read so far another one than theirs."""
         found = outside_sentences(self.outside, "environment", "the working space",
                                   "give images, or lamps, in a wider space, or a map without such colours")
-        found += [*full_sentences(self._full), *list(self._eight_bit.values())[:1], *multiplied_sentences(self._multiplied)]
+        found += [*full_sentences(self._full), *list(self._encodings.values())[:1], *multiplied_sentences(self._multiplied)]
         fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
         if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
             half = np.pi / (2 * rows)

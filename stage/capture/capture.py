@@ -12,13 +12,12 @@ from stage.capture.camera import Camera
 from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, Light, OffLight, PointLight
 from stage.capture.manifest import FILE_NAME, LIT_BY, Frame, Manifest, read_manifest
 from stage.colour import radiance as radiances
-from stage.colour.colour_spaces import is_linear
+from stage.colour.colour_spaces import NAMES, is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.folders import advice
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.formats.exif import Exposure, check_agreement, exposure_times, multiplied_otherwise, unused_exposures
-from stage.formats.exr import PRIMARIES
 from stage.formats.images import ImageHeader
 from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
@@ -83,8 +82,8 @@ class Capture:
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         headers = capture._check_files()
         capture = capture._exposed(headers)
-        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_pixels(headers),
-                                           *capture.manifest.assumed))
+        capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_encodings(headers),
+                                           *capture._other_pixels(headers), *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -235,12 +234,20 @@ class Capture:
         return self if timed else replace(self, doubts=(*unused_exposures(exposures), *multiplied_otherwise(multipliers)))
 
     def _other_spaces(self, headers: Mapping[str, ImageHeader]) -> list[str]:
-        """Return a sentence where images declare another scene-linear colour space than the manifest."""
+        """Return a sentence where images declare another colour space than the manifest has, of which they are linear."""
         space = self.manifest.color_space
-        others = sorted(name for name, header in headers.items() if header.space not in ("", space)) if space in PRIMARIES else []
+        known = space in NAMES and is_linear(space)
+        others = sorted(name for name, header in headers.items() if header.space in NAMES and header.space != space) if known else []
         default = "" if "color_space" in self.manifest.model_fields_set else " by default"
         return [f"color_space: {space} is declared{default}, and {headers[others[0]].space} by {len(others)} of the {len(headers)} images, "
                 f"{others[0]} the first of them: they are read as {space}; declare the space that they have"] if others else []
+
+    def _other_encodings(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where Radiance headers say what the colour space of the manifest does not."""
+        space = self.manifest.color_space
+        others = sorted(name for name, header in headers.items() if header.encoding) if space == "lin_rec709_scene" else []
+        return [f"{others[0]}: its header says {headers[others[0]].encoding}, and so do those of {len(others)} of {len(headers)} images: "
+                f"it is not heeded, and values are read as {space}; declare the color_space that they have"] if others else []
 
     def _other_pixels(self, headers: Mapping[str, ImageHeader]) -> list[str]:
         """Return a sentence where images declare pixels of another shape than the camera has."""

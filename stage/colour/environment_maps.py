@@ -24,9 +24,12 @@ few values, and those of other maps are not all within the rounding of half floa
 HALF_ROUNDING = 2.0**-11
 
 
-def eight_bit_sentence(name: str, pixels: np.ndarray, space: str) -> str | None:
-    """Return a sentence about an EXR map all of whose values are those of an image of 8 bits, or None.
+def encoding_sentence(name: str, pixels: np.ndarray, space: str) -> str | None:
+    """Return a sentence about a map whose values are all those of an image of 8 bits, or are above the white of their space; or None.
     `pixels`: [rows, cols, 3] as recorded. `space`: the colour space in which they are taken."""
+    if not is_linear(space) and (brightest := float(pixels.max())) > 1 + HALF_ROUNDING:
+        return (f"environment {name}: its header declares {space}, by which its values are decoded, and they go up to {brightest:.4g}, "
+                "where 1 is white: if they are linear, bright parts are far too bright; declare the space that they have (colorInteropID)")
     values = np.unique(pixels[:: -(-pixels.shape[0] // LOOKED_AT), :: -(-pixels.shape[1] // LOOKED_AT)])
     if not LEAST_CODES <= len(values) <= 256 or not 0 <= values[0] <= values[-1] <= 1 + HALF_ROUNDING:
         return None
@@ -82,13 +85,14 @@ def check_environment(path: Path) -> None:
 
 def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None,
                      outside: dict[str, float] | None = None, full: dict[str, float] | None = None,
-                     eight_bit: dict[str, str] | None = None) -> np.ndarray:
+                     encodings: dict[str, str] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
     `path`: lat-long .exr or .hdr. `space`: the scene-linear colour space of the result. `clipped`: is given the number of pixels with
     values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. `outside`: is given the
     part of its light that colours outside of the gamut of `space` gain, 0 or above. `full`: is given the part of its light that texels at
-    the largest half value hold, if it is EXR. `eight_bit`: is given the sentence of a map of 8 bits. Returns [rows, cols, 3] float32,
-    scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is 0."""
+    the largest half value hold, if it is EXR. `encodings`: is given the sentence of a map that seems to be encoded otherwise than it is
+    taken. Returns [rows, cols, 3] float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of
+    `space` has a channel that is 0."""
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:
         check_radiance(path, pixels, remedy=CLIP_NEGATIVE)
@@ -101,8 +105,12 @@ def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None =
         converted = convert(pixels, given, space)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
-    if eight_bit is not None and (said := eight_bit_sentence(path.name, pixels, given)) is not None:
-        eight_bit[path.name] = said
+    told = images.read_header(path).encoding
+    said = encoding_sentence(path.name, pixels, given) if not told else (
+        f"environment {path.name}: its header says {told}, which is not heeded: its values are taken as linear light of Rec.709; convert "
+        "the map to that")
+    if encodings is not None and said is not None:
+        encodings[path.name] = said
     shown = np.maximum(converted, 0)
     height = np.sin(np.pi * (np.arange(len(shown)) + 0.5) / len(shown))
     if full is not None and path.suffix.lower() == ".exr" and (at_end := (pixels == exr.HALF_MAX).any(axis=-1)).any():

@@ -3,7 +3,8 @@ factor that a Radiance file says its values were multiplied by.
 
 Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tags ExposureTime, FNumber and
 PhotographicSensitivity, and Orientation, which TIFF 6.0 defines; in Radiance files the order of the rows and columns says the same.
-Ward, "Radiance File Formats": every EXPOSURE of a header is a factor that the values have been multiplied by.
+Ward, "Radiance File Formats": every EXPOSURE of a header is a factor that the values have been multiplied by, and so are the three of every
+COLORCORR; PRIMARIES are x and y of red, green, blue and white.
 """
 
 import math
@@ -19,6 +20,10 @@ SAME = 0.01
 """Part by which two recorded values of one setting may differ: they are fractions of small integers."""
 RADIANCE_HEADER_BYTES = 1 << 16
 """Bytes of a Radiance file in which its header is looked for: programs add a line each."""
+NEUTRAL = {b"GAMMA": (1.0,), b"COLORCORR": (1.0, 1.0, 1.0), b"PRIMARIES": (0.64, 0.33, 0.295, 0.6, 0.15, 0.06)}
+"""First numbers of the lines of a Radiance header with which its values are linear and of Rec.709, whatever white it has."""
+NEUTRAL_TOLERANCE = 0.015
+"""Largest difference from these: Radiance's own primaries have their green at .29, those of Rec.709 at .30."""
 UPRIGHT = 1
 """The orientation of images whose first row is the top and whose first column is the left."""
 
@@ -72,6 +77,23 @@ def radiance_multiplier(file: BinaryIO) -> float:
         return sound(math.prod(map(float, factors))) or 1.0
     except ValueError:  # no number
         return 1.0
+
+
+def radiance_encoding(file: BinaryIO) -> str:
+    """Return the lines of a Radiance header that say its values are not linear ones of Rec.709; empty where it has none. Leaves the file at
+    its beginning."""
+    file.seek(0)
+    header, end, _ = file.read(RADIANCE_HEADER_BYTES).partition(b"\n\n")
+    file.seek(0)
+    found = []
+    for name, numbers in re.findall(rb"^(GAMMA|COLORCORR|PRIMARIES)=([-+.0-9eE \t]+)$", header, re.MULTILINE) if end else []:
+        try:
+            values = [float(number) for number in numbers.split()]
+        except ValueError:  # no number
+            continue
+        if any(abs(value - neutral) > NEUTRAL_TOLERANCE for value, neutral in zip(values, NEUTRAL[name], strict=False)):
+            found.append(f"{name.decode()}={' '.join(f'{value:.4g}' for value in values)}")
+    return ", ".join(found)
 
 
 def multiplied_otherwise(multipliers: Mapping[str, float]) -> list[str]:

@@ -224,18 +224,27 @@ PRIMARIES_TOLERANCE = 2e-3
 """The largest difference of a chromaticity coordinate, because writers round the coordinates."""
 
 
+WRITTEN_BY_OIIO = {
+    "acescg": "lin_ap1_scene", "lin_ap1": "lin_ap1_scene", "aces2065-1": "lin_ap0_scene", "lin_ap0": "lin_ap0_scene",
+    "lin_rec2020": "lin_rec2020_scene", "lin_p3d65": "lin_p3d65_scene", "srgb": "srgb_texture", "srgb_texture": "srgb_texture",
+}
+"""Values of `oiio:ColorSpace`, in small letters, by which OpenImageIO before version 3.1, and programs that rest on it, name a space."""
+UNDECLARED = ("unknown", "data")
+"""Values of `colorInteropID` that name no space of colours."""
+
+
 def chromaticities(space: str) -> Sequence[float] | None:
     """Return x and y of red, green, blue and white of a colour space; None: the library does not know it."""
     return OpenEXR.colorInteropIDToChromaticities(space)
 
 
 def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
-    """Return the scene-linear colour space that a header declares by `colorInteropID` or by `chromaticities`, else `default`.
+    """Return the colour space that a header declares by `colorInteropID`, `chromaticities` or `oiio:ColorSpace`, else `default`.
     Raises ValueError if the chromaticities are those of no known colour space."""
-    if (name := metadata.get("colorInteropID")) is not None:
+    if (name := metadata.get("colorInteropID", UNDECLARED[0])) not in UNDECLARED:
         return str(name)
     if (given := metadata.get("chromaticities")) is None:
-        return default
+        return WRITTEN_BY_OIIO.get(str(metadata.get("oiio:ColorSpace")).lower(), default)
     for space in PRIMARIES:
         if (known := chromaticities(space)) is not None and np.allclose(given, known, atol=PRIMARIES_TOLERANCE):
             return space

@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from stage import inputs
 from stage.errors import ImageError
 from stage.formats import avif, camera_raw, exr, integrity
-from stage.formats.exif import TURNS, UPRIGHT, Exposure, radiance_multiplier, sound, upright, upright_size
+from stage.formats.exif import TURNS, UPRIGHT, Exposure, radiance_encoding, radiance_multiplier, sound, upright, upright_size
 from stage.pixels import Crop
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp", ".ppm", ".pgm"}
@@ -37,7 +37,8 @@ class ImageHeader(NamedTuple):
     exposure: Exposure = Exposure()  # as EXIF says
     half: bool = False  # whether all colour channels hold half values
     multiplied: float = 1.0  # the factor that a Radiance file says its values were multiplied by
-    space: str = ""  # the scene-linear colour space that an EXR file declares; empty where it declares none that is known
+    encoding: str = ""  # what a Radiance file says of values that are not linear ones of Rec.709
+    space: str = ""  # the colour space that an EXR file declares; empty where it declares none
     pixel_aspect: float = 1.0  # the width of a pixel over its height, as an EXR file declares
 
 
@@ -90,7 +91,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
         except ValueError:
             space = ""
         return ImageHeader(header.width, header.height, len(colours), len(header.channels), False, half=header.half.issuperset(colours),
-                           space=space if space in exr.PRIMARIES else "", pixel_aspect=_pixel_aspect(header.metadata))
+                           space=space, pixel_aspect=_pixel_aspect(header.metadata))
     _check_suffix(path)
     if suffix == ".png":
         integrity.check_png(path, source.file, contents=False)
@@ -105,9 +106,11 @@ def header_of(source: inputs.Source) -> ImageHeader:
     with _decoder(source) as decoder:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
-        return ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                           spec.format.basetype not in FLOATING, orientation, _exposure(spec),
-                           multiplied=radiance_multiplier(source.file) if suffix == ".hdr" else 1.0)
+        stated = ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
+                              spec.format.basetype not in FLOATING, orientation, _exposure(spec))
+    if suffix == ".hdr":
+        return stated._replace(multiplied=radiance_multiplier(source.file), encoding=radiance_encoding(source.file))
+    return stated
 
 
 def read_pixels(path: str | Path) -> np.ndarray:

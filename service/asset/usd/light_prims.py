@@ -36,9 +36,9 @@ LIGHT_SPACE = "lin_rec709_scene"
 
 
 def write_dome_texture(environment: Path, texture: Path, *, clipped: dict[str, int] | None = None,
-                       outside: dict[str, float] | None = None) -> None:
-    """Write a lat-long environment map, .exr or .hdr, as the texture of a dome light, and count what is clipped, and what is outside."""
-    write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped, outside=outside), texture)
+                       outside: dict[str, float] | None = None, encodings: dict[str, str] | None = None) -> None:
+    """Write a lat-long environment map, .exr or .hdr, as the texture of a dome light, with findings as `read_environment` gives them."""
+    write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped, outside=outside, encodings=encodings), texture)
 
 
 def write_radiance(radiance: np.ndarray, texture: Path) -> None:

@@ -50,6 +50,8 @@ class Surroundings(NamedTuple):
     """Counts of clipped values as in stage.colour.environment_maps.read_environment, for lat-long maps."""
     outside: dict[str, float] | None = None
     """Is given what colours gain of which Rec.709 has a channel below 0, by files; see the same function."""
+    encodings: dict[str, str] | None = None
+    """Is given the sentence of an environment whose values seem to be encoded otherwise than they are taken; see the same function."""
 
 
 class AssetFiles(NamedTuple):
@@ -88,7 +90,8 @@ def define_surroundings(files: AssetFiles, surroundings: Surroundings, camera: C
     if surroundings.environment is not None:
         with layers.lighting(ENVIRONMENT) as usd_stage:
             texture = layers.lights / f"{ENVIRONMENT}.exr"
-            write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped, outside=outside)
+            write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped, outside=outside,
+                               encodings=surroundings.encodings)
             define_dome(usd_stage, layers.root.AppendChild(ENVIRONMENT.capitalize()), f"./{texture.name}")
         textures.append(texture)
     files.lights.extend([*layers.light_files, *textures])

@@ -1,11 +1,13 @@
 """relit publish: what is refused, what is replaced, and that nothing is left half-written."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from service.publish.publish import publish
 from service.requests.publish import PublishRequest
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import edit_frame, files_in, make_scene, write_capture
 
 IIIF = ["--as", "iiif", "--url", "https://museum.org/cap"]
@@ -108,5 +110,8 @@ def test_a_folder_of_results_stands_for_its_capture_and_shows_its_maps(relit, tm
         relit.done("publish", *given, "--to", tmp_path / name, *IIIF)
     assert files_in(tmp_path / "results") == files_in(tmp_path / "both")
     relit.done("publish", tmp_path / "maps", "--to", tmp_path / "page", "--as", "web")
+    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    replace(maps, normal=0.5 + 0.5 * maps.normal).write(tmp_path / "maps" / "maps.exr")
+    relit("publish", tmp_path / "maps", "--to", tmp_path / "none", *IIIF).refused("not 1, as where they are stored as 0…1")
     cap.rename(tmp_path / "elsewhere")
     relit("publish", tmp_path / "maps", "--to", tmp_path / "none", *IIIF).refused("which is not there")

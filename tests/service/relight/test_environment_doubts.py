@@ -54,6 +54,25 @@ def test_radiance_maps_that_were_multiplied_are_said(tmp_path, factors, words):
     assert [words in each for each in environments.doubts()] == ([] if words is None else [True])
 
 
+@pytest.mark.parametrize(("lines", "said"), [
+    (("GAMMA=2.2",), "says GAMMA=2.2,"), (("COLORCORR= 2.0 1 0.5", "GAMMA= 1"), "says COLORCORR=2 1 0.5,"),
+    (("PRIMARIES= .708 .292 .170 .797 .131 .046 .3127 .3290",), "says PRIMARIES=0.708 0.292"), (("GAMMA=1.2.3",), None),
+    (("PRIMARIES=.640 .330 .290 .600 .150 .060 .333 .333", "COLORCORR= 1 1 1"), None)])
+def test_radiance_maps_of_another_encoding_are_said(tmp_path, lines, said):
+    environments = Environments(write_radiance(tmp_path / "sky.hdr", np.full((16, 32, 3), 0.5), *lines))
+    assert (environments.read(tmp_path / "sky.hdr", REC709).radiance == 0.5).all()
+    assert [said in each for each in environments.doubts()] == ([] if said is None else [True])
+
+
+@pytest.mark.parametrize(("declared", "value", "wanted", "said"), [
+    ("sRGB", 0.5, ((0.5 + 0.055) / 1.055) ** 2.4, False), ("sRGB", 3.0, ((3.0 + 0.055) / 1.055) ** 2.4, True), ("Linear", 3.0, 3.0, False)])
+def test_the_space_of_older_openimageio_is_heeded(tmp_path, declared, value, wanted, said):
+    """Grey by the formula of IEC 61966-2-1; what is decoded above white is said."""
+    environments = Environments(write_exr(tmp_path / "sky.exr", np.full((16, 32, 3), value), **{"oiio:ColorSpace": declared}))
+    np.testing.assert_allclose(environments.read(tmp_path / "sky.exr", REC709).radiance, wanted, rtol=1e-3)
+    assert ["declares srgb_texture" in each and "go up to 3," in each for each in environments.doubts()] == [True] * said
+
+
 @pytest.mark.parametrize(("encoded", "dtype"), [(True, np.float16), (True, np.float32), (False, np.float16), (False, np.float32)])
 def test_maps_of_8_bits_are_said(tmp_path, encoded, dtype):
     """A sky of 8 bits as it is recorded, or decoded by the formula of IEC 61966-2-1."""

@@ -10,7 +10,17 @@ from stage.capture.camera import Camera, Distortion
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_solvable, distant_lights
 from stage.errors import ImageError, ManifestError, StorageError
-from tests.scenes.captures import edit_frame, edit_manifest, make_scene, ring, write_capture, write_exr, write_image
+from tests.scenes.captures import (
+    edit_frame,
+    edit_manifest,
+    make_scene,
+    manifest_of,
+    ring,
+    write_capture,
+    write_exr,
+    write_image,
+    write_radiance,
+)
 
 SCENE = make_scene(size=6, lights=4)
 
@@ -33,6 +43,20 @@ def test_another_colour_space_in_the_images_is_said(tmp_path):
     assert "lin_ap1_scene by 2 of the 4 images, 001.exr the first" in doubt and "lin_rec709_scene" in doubt
     edit_manifest(tmp_path, color_space="lin_ap1_scene")
     assert Capture.open(tmp_path).doubts == ()
+
+
+def test_encodings_that_files_declare_are_said(tmp_path):
+    """EXR images that OpenImageIO made of photographs, and Radiance images of another gamma: both were taken as linear without a word."""
+    write_capture(tmp_path, SCENE)
+    write_exr(tmp_path / "002.exr", SCENE.images[2], colorInteropID="srgb_rec709_scene")
+    doubt, = Capture.open(tmp_path).doubts
+    assert "srgb_rec709_scene by 1 of the 4 images, 002.exr" in doubt
+    frames = manifest_of(SCENE)["frames"]
+    for index, (image, frame) in enumerate(zip(SCENE.images, frames, strict=True)):
+        frame["image"] = write_radiance(tmp_path / f"{index}.hdr", image, "GAMMA=2.2").name
+    edit_manifest(tmp_path, frames=frames)
+    doubt, = Capture.open(tmp_path).doubts
+    assert doubt.startswith("0.hdr: its header says GAMMA=2.2, and so do those of 4 of 4 images")
 
 
 def test_pixels_of_another_shape_than_the_camera_are_named(tmp_path):

@@ -222,6 +222,14 @@ def test_chromaticities_name_a_space_where_nothing_else_does(tmp_path, space):
     assert exr.color_space_of({"chromaticities": primaries, "colorInteropID": "lin_ap0_scene"}) == "lin_ap0_scene"
 
 
+@pytest.mark.parametrize(("attributes", "space"), [
+    ({"oiio:ColorSpace": "ACEScg"}, "lin_ap1_scene"), ({"oiio:ColorSpace": "Linear"}, "lin_rec709_scene"),
+    ({"colorInteropID": "unknown", "oiio:ColorSpace": "lin_ap0"}, "lin_ap0_scene"), ({"colorInteropID": "data"}, "lin_rec709_scene")])
+def test_spaces_are_declared_in_other_words(tmp_path, attributes, space):
+    path = write_exr(tmp_path / "a.exr", PIXELS, **attributes)
+    assert exr.color_space_of(exr.read_header(path).metadata) == space
+
+
 def test_chromaticities_of_no_space_are_refused():
     with pytest.raises(ValueError, match="no known colour space"):
         exr.color_space_of({"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.15, 0.05, 0.3, 0.3)})

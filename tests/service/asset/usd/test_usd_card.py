@@ -11,6 +11,7 @@ from service.asset.usd.surroundings import Surroundings
 from stage.capture.camera import Distortion
 from stage.colour.colour import rgb_matrix
 from stage.formats import exr
+from tests.scenes.captures import write_radiance
 from tests.scenes.surfaces import make_wave
 from tests.scenes.surroundings import COVERAGE, write_frames
 
@@ -169,6 +170,12 @@ def test_a_dome_light_has_the_map(suffix, relit, tmp_path):
     channels, metadata = exr.read(file.Get().resolvedPath)
     np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), RADIANCE, atol=3e-4)  # half
     assert metadata["colorInteropID"] == "lin_rec709_scene" and provenance["environment"]
+
+
+def test_a_map_whose_header_says_another_encoding_is_named(relit, tmp_path):
+    sky = write_radiance(tmp_path / "sky.hdr", RADIANCE, "GAMMA=2.2", "EXPOSURE=4")
+    told = export_with_environment(relit, tmp_path, sky).out
+    assert "its header says GAMMA=2.2" in told and "multiplied by 4 (EXPOSURE)" in told
 
 
 def test_other_primaries_are_converted_and_a_bright_sun_is_kept(relit, tmp_path):
