@@ -33,7 +33,7 @@ from stage.errors import ManifestError, storage
 from stage.files import write_text
 from stage.formats.ply import POINTS_FILE, write_ply
 from stage.patterns.base import UniformPattern
-from stage.results.depth_maps import DEPTH_FILE, CoordinateMaps, DepthMaps
+from stage.results.depth_maps import CALIBRATION_SIGMA, DEPTH_FILE, CoordinateMaps, DepthMaps
 from stage.stack.fingerprint import Fingerprints, digest
 from stage.stack.ingest import CACHE_FOLDER
 
@@ -120,6 +120,8 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
         _check_plausible(solution, capture, request, using)
         _tell_shared_error(solution, capture, using)
+        if (shared := solution.facts.get("calibration_sigma_m", 0.0)) > 0:
+            sources[CALIBRATION_SIGMA] = f"{shared:g}"
         if capture.camera.projection == "orthographic" and capture.camera.pixel_size_m is None:
             solution.warnings.append(f"camera.pixel_size_m is missing: x and y of {POINTS_FILE} are in pixels, and its z in metres")
         timings.stage("points", 1)

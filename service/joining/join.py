@@ -19,7 +19,7 @@ from service.solve.height.parts import numbered
 from stage.capture.camera import Camera
 from stage.errors import ResultError
 from stage.files import write_text
-from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.depth_maps import CALIBRATION_SIGMA, DEPTH_FILE, DepthMaps
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from stage.results.result_metadata import result_file
 from stage.stack.fingerprint import digest
@@ -122,7 +122,9 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
     placed = joined.placed & maps.mask
     turned = degrees_between(np.moveaxis(maps.normal, -1, 0), joined.normal)[placed]
     before = depth.sigma[placed & depth.mask]
+    shared = depth.provenance.get(CALIBRATION_SIGMA)
     return {
+        **({} if shared is None else {"calibration_sigma_m": float(shared)}),
         "pixels": {"mask": int(maps.mask.sum()), "with_depth": overlap, "placed": int(placed.sum()),
                    "beside_steps": int((joined.guessed & maps.mask).sum()), "rejected_depths": int(joined.rejected.sum()),
                    "solved": int((maps.mask & joined.placed & ~joined.guessed & ~joined.rejected).sum())},
@@ -142,6 +144,9 @@ def _median(values: np.ndarray) -> float:
 
 def _warnings(facts: dict[str, Any]) -> list[str]:
     pixels, found = facts["pixels"], []
+    if (shared := facts.get("calibration_sigma_m", 0.0)) > (own := facts["sigma_m"]["joined_median"]) > 0:
+        found.append(f"depth: its calibration leaves {shared:.3g} m open of all depths together, {shared / own:.2g} times height_sigma "
+                     "(median), which does not hold what all pixels share")
     if facts["depth_noise_factor"] > NOISIER:
         found.append(f"depth: its noise is {facts['depth_noise_factor']:.2g} times sigma.Z, and counts as such")
     if facts["depth_shared_error_m"] > SHARED * facts["sigma_m"]["depth_median"]:

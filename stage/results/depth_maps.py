@@ -12,6 +12,8 @@ from stage.formats import exr
 from stage.results.result_metadata import camera_and_provenance, result_metadata
 
 DEPTH_FILE = "depth.exr"
+CALIBRATION_SIGMA = "relit:calibration_sigma_m"
+"""The attribute with the standard deviation, in metres at the median depth, that the calibration leaves open of all depths together."""
 LAYERS: dict[str, tuple[str, type[np.floating[Any]]]] = {
     "depth": ("depth.Z", np.float32),
     "range": ("range.Z", np.float32),

@@ -52,6 +52,7 @@ def test_what_the_calibration_leaves_open_is_said(relit, tmp_path):
         path.write_text(json.dumps(manifest))
         maps, report = solve(relit, tmp_path)
         assert report["found"]["calibration_sigma_m"] == pytest.approx(part * np.median(maps.depth[maps.mask]), rel=0.01)
+        assert float(maps.provenance["relit:calibration_sigma_m"]) == report["found"]["calibration_sigma_m"]
         assert any("projector.depth_sigma" in sentence for sentence in report["warnings"]) == said
 
 

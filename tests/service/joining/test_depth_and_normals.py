@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from kernels.status import Status
 from service.joining.depth_and_normals import Joined, join_depth
 from service.light_estimation.lambertian import degrees_between
 from stage.capture.camera import Camera
-from stage.results.depth_maps import DepthMaps
+from stage.results.depth_maps import CALIBRATION_SIGMA, DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.marks import first_short
 from tests.scenes.joined import MM, View, drifting, see
@@ -288,6 +289,19 @@ def test_the_joined_surface_is_better_than_both(relit, tmp_path, perspective):
     report = json.loads((tmp_path / "joined" / "report.json").read_text())
     assert report["pixels"]["solved"] == found.mask.sum() and report["sigma_m"]["depth_median"] == pytest.approx(SIGMA, rel=1e-3)
     assert report["relief_unexplained"] < 0.1
+
+
+def test_what_the_calibration_leaves_open_is_said_again(relit, tmp_path):
+    """A depth whose scale is known to 2 % was joined to hundredths of a millimetre without a word."""
+    solved, depth, z, _ = write(tmp_path)
+    for shared, said in ((0.02 * abs(float(np.median(z))), True), (1e-6, False)):
+        maps = DepthMaps.read(depth / "depth.exr")
+        replace(maps, provenance={CALIBRATION_SIGMA: f"{shared:g}"}).write(depth / "depth.exr")
+        relit.done("join", solved, depth, "--out", tmp_path / "joined")
+        report = json.loads((tmp_path / "joined" / "report.json").read_text())
+        assert report["calibration_sigma_m"] == pytest.approx(shared, rel=1e-5)
+        words = f"depth: its calibration leaves {shared:.3g} m open of all depths together"
+        assert any(each.startswith(words) for each in report["warnings"]) == said
 
 
 def test_an_asset_is_made_of_it(relit, tmp_path):
