@@ -139,7 +139,12 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
         frame[:, batch.pixels], specular[:, batch.pixels] = lit[:3] + lit[3:], lit[3:]
         done += len(batch.pixels)
         timings.advance(done)
-    return frame, specular, close.doubts
+    assert maps.diffuse_albedo is not None
+    usual = float(np.median(maps.diffuse_albedo.reshape(-1, 3)[model.pixels].max(axis=1)))
+    bright = () if usual <= 1 else (
+        f"{path}: layer diffuse_albedo is {usual:.3g} in the median, and nothing reflects more light than it gets: the picture is too "
+        "bright; give albedo as 0…1 (values of 8 bits divided by 255, and decoded to linear)",)
+    return frame, specular, (*close.doubts, *bright)
 
 
 def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, path: Path, lighting: ScheduledFrame,

@@ -57,6 +57,15 @@ def test_places_in_millimetres_are_named(relit, maps, tmp_path, light):
         assert "warning" not in relit.done("shade", maps, option, near, "--out", tmp_path / "p.exr").out
 
 
+def test_an_albedo_of_8_bits_is_named(relit, tmp_path):
+    """White paint of .9 is right; as codes it made pictures 255 times too bright without a word."""
+    for factor, said in ((1, False), (255, True)):
+        albedo = np.full((16, 16, 3), 0.9 * factor, np.float32)
+        folder = write_relief(tmp_path / str(factor), np.zeros((16, 16), np.float32), diffuse_albedo=albedo)
+        told = relit.done("shade", folder, "--light", text([0, 0, 0.1], [2e-3] * 3), "--out", tmp_path / "p.exr").out
+        assert ("layer diffuse_albedo is 230 in the median" in told) == said
+
+
 def test_two_materials_of_a_pixel_are_their_mean(relit, tmp_path):
     """Left of the middle a share of another lobe, right of it one material. Tolerance: half rounding of two lobes and the share."""
     place, share = np.array([0.01, 0.015, 0.03]), 0.7
