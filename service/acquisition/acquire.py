@@ -129,6 +129,7 @@ class Acquisition:
                     self._review(lights, stopping)
             finally:
                 settings = self._close(lights)
+                self.journal.close()
             if len(self.journal.taken) == len(self.shots):
                 receiving.pop_all()
         faults = tuple(fault for found in self.faults.values() for fault in found)

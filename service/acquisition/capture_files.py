@@ -6,12 +6,14 @@ release whose picture is still where the camera put it.
 """
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
 import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -128,15 +130,33 @@ class Journal:
         self.settings: Mapping[str, str] = {}
         """The settings that the camera told when the first picture was to be taken, by name."""
         self._head = {"schema": JOURNAL_SCHEMA, **head}
+        self._held = ExitStack()
         with storage("read", self._path):
             if self._path.exists() and self._path.stat().st_size > 0:
+                self._hold()
                 self._read(self._head)
 
     def begin(self, files: Sequence[str]) -> None:
         """Make the folder, and record what is captured and the files that were there before, where a camera writes files."""
         with storage("write", self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._hold()
         self._append({**self._head, "files": list(files), "time": time.time()})
+
+    def close(self) -> None:
+        """Let other processes take this capture."""
+        self._held.close()
+
+    def _hold(self) -> None:
+        """Refuse to take a capture that another process is taking, whose unfinished files this one would remove."""
+        file = self._held.enter_context(open(self._path, "ab"))  # noqa: SIM115 (closed by close)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RequestError(f"{self._path.parent}: is being taken by another `relit capture`: wait until that has ended, or stop it"
+                               ) from error
+        except OSError:  # a file system without locks
+            pass
 
     def camera(self, settings: Mapping[str, str]) -> None:
         """Record the settings that the camera tells, if no picture was taken under earlier ones."""

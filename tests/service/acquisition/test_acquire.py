@@ -287,6 +287,17 @@ def test_a_capture_goes_on_after_it_was_cut_off_at_any_picture(tmp_path, stage, 
     assert stage.released <= LAMPS + 2  # those of the plan, and one that shows that nothing moved
 
 
+def test_two_runs_do_not_take_one_capture(tmp_path, stage):
+    """The second one removed unfinished files of the first, which then ended because they were not there."""
+    rig, ask = by_hand(tmp_path, stage)
+    first = Acquisition(request(tmp_path, stage, rig), ask)
+    with pytest.raises(RequestError, match=f"^{tmp_path / 'capture'}: is being taken by another"):
+        Acquisition(request(tmp_path, stage, rig), ask)
+    first.run()
+    check(tmp_path / "capture", stage)
+    assert acquire(request(tmp_path, stage, rig), ask).taken == 0
+
+
 def test_a_picture_that_is_there_is_taken_again_on_request(tmp_path, stage):
     rig, ask = by_hand(tmp_path, stage)
     acquire(request(tmp_path, stage, rig), ask)
