@@ -60,6 +60,8 @@ def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrup
         print(f"state       {ended.state}, {(ended.finished_at - ended.started_at).total_seconds():.1f} s")
     if out is not None:
         download(client, job, out)
+    for sentence in client.jobs.log(job).warnings:
+        print(f"warning     {sentence}")
 
 
 def make_folder(out: Path) -> None:

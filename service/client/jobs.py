@@ -16,7 +16,7 @@ from service.client.errors import FileError, JobEnded, refusal
 from service.client.local_files import file_errors
 from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress, transfer_all
 from service.reporting.progress import Progress
-from service.requests.answers import DeliveryView, HookList, HookView, JobPage, JobView, NewHookView, ResultPage, ResultView
+from service.requests.answers import DeliveryView, HookList, HookView, JobLog, JobPage, JobView, NewHookView, ResultPage, ResultView
 from service.requests.base.base import JobRequest
 from service.requests.hooks import NewHook
 from service.requests.states import ENDED, SUCCEEDED, JobState
@@ -132,6 +132,10 @@ class Jobs:
     def get(self, job: str) -> JobView:
         """Return one job."""
         return self._connection.ask(JobView, "GET", self._at(job))
+
+    def log(self, job: str) -> JobLog:
+        """Return what happened to a job, and the warnings about what it has made."""
+        return self._connection.ask(JobLog, "GET", f"{self._at(job)}/log")
 
     def all(self, states: Sequence[JobState] = ()) -> Iterator[JobView]:
         """Iterate over the jobs of the project, the newest first; if `states` are given, over the jobs in one of them."""

@@ -63,6 +63,10 @@ class JobView(View):
         return cls.model_validate({**row, "progress": progress})
 
 
+WARNING = "warning: "
+"""The beginning of the entry of a log that is a warning about what a job has made."""
+
+
 class LogEntry(View):
     """Something that happened to a job."""
 
@@ -75,6 +79,11 @@ class JobLog(View):
     """The events of a job, the oldest first; of a long log, the first thousand entries."""
 
     entries: list[LogEntry]
+
+    @property
+    def warnings(self) -> list[str]:
+        """The warnings about what the job has made."""
+        return [entry.text.removeprefix(WARNING) for entry in self.entries if entry.text.startswith(WARNING)]
 
 
 class JobPage(View):

@@ -269,6 +269,17 @@ def log_of(database: Database, job: str) -> list[sa.RowMapping]:
     return database.rows(sa.select(job_log.c.at, job_log.c.attempt, job_log.c.text).where(job_log.c.job == job).order_by(job_log.c.number))
 
 
+def note_once(database: Database, job: str, texts: Sequence[str]) -> None:
+    """Add entries to the log of a job that it has not, as those of a step that is done again."""
+    def work(connection: sa.Connection) -> None:
+        there = set(connection.scalars(sa.select(job_log.c.text).where(job_log.c.job == job)))
+        for text in dict.fromkeys(map(storable, texts)):
+            if text not in there:
+                note(connection, job, text)
+
+    database.transact(work)
+
+
 def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
     """Return the jobs that ended before a time."""
     return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.attempt).where(jobs.c.state.in_(ENDED), jobs.c.finished_at < when))

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
+from service.requests.answers import WARNING
 from service.requests.base.annotations import page_of
 from service.requests.base.base import JobRequest, Options
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
@@ -93,6 +94,12 @@ class StepFiles(NamedTuple):
     job: Job
     context: WorkerContext
     progress: Progress
+
+    def tell(self, result: object) -> None:
+        """Write the warnings that a product's result has, if it has any, into the log of the job."""
+        if warnings := tuple(getattr(result, "warnings", ())):
+            jobs.note_once(self.context.database, self.job.id,
+                           [without_places(f"{WARNING}{warning}", self.job.id, self.context) for warning in warnings])
 
     def cache(self, capture: str) -> Path:
         """Return the folder of the image stack of a capture."""

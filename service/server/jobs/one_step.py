@@ -41,7 +41,7 @@ def _product(function: str, model: type[Options], file: str = "", *, capture_as:
     `capture_as`: the field for the folder of the job's capture, where the request of the product has another word for it."""
     def make(request: Any, files: StepFiles) -> None:
         captured = {} if capture_as is None else {capture_as: files.intake(request.capture)}
-        resolve_name(function)(files.request(model, request, out=files.out / file, **captured, **given), files.progress)
+        files.tell(resolve_name(function)(files.request(model, request, out=files.out / file, **captured, **given), files.progress))
 
     return make
 
@@ -51,7 +51,7 @@ def _rig(function: str, model: type[Options]) -> Callable[[Any, StepFiles], None
     def make(request: Any, files: StepFiles) -> None:
         captures = getattr(request, "captures", None) or (request.capture,)
         manifests = [files.out / f"{capture}.{FILE_NAME}" for capture in (*captures, *request.apply_to)]
-        resolve_name(function)(files.request(model, request), files.progress, manifest_paths=manifests)
+        files.tell(resolve_name(function)(files.request(model, request), files.progress, manifest_paths=manifests))
 
     return make
 
@@ -61,7 +61,7 @@ def export(request: jobs.ExportJob, files: StepFiles) -> None:
     from service.export.export import export as make_asset
     from service.requests.export import ExportRequest
 
-    make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress)
+    files.tell(make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress))
     files.write_annotations(request.rig or request.maps)
 
 
@@ -83,8 +83,8 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
 
     kind = BasisKind(request.options.basis)
     options = {name: value for name, value in dict(request.options).items() if name != "basis"}
-    make_basis(BasisRequest(capture=files.intake(request.capture), out=files.out / f"{BASIS}{SUFFIXES[kind]}", kind=kind,
-                            device=files.context.device, cache=files.cache(request.capture), **options), files.progress)
+    files.tell(make_basis(BasisRequest(capture=files.intake(request.capture), out=files.out / f"{BASIS}{SUFFIXES[kind]}", kind=kind,
+                                       device=files.context.device, cache=files.cache(request.capture), **options), files.progress))
 
 
 def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
@@ -104,7 +104,7 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
         for run in request.study.runs:
             (folder / run.result).symlink_to(files.maps(run.result), target_is_directory=True)
         write_text(folder / STUDY_FILE, request.study.model_dump_json(by_alias=True))
-        gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress)
+        files.tell(gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress))
 
 
 def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles) -> None:
@@ -113,8 +113,8 @@ def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles
 
     folder = files.intake(request.capture)
     sweep = file_within(folder, request.sweep, "sweep")
-    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.context.device), files.progress,
-                  allowed=time_steps(folder))
+    files.tell(calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.context.device),
+                             files.progress, allowed=time_steps(folder)))
 
 
 MEASURE = "measure"

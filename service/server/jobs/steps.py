@@ -145,7 +145,7 @@ def _solve(request: jobs.SolveJob, number: int | None, files: StepFiles, pieces:
     sharing = SharedSolve(pieces, leads=True, invite=pieces.invite) if leads else SharedSolve(pieces, leads=False)
     wanted = _solve_request(request, number, files)
     if number is None:
-        (solve if leads else help_solve)(wanted, files.progress, sharing=sharing)
+        files.tell((solve if leads else help_solve)(wanted, files.progress, sharing=sharing))
     else:
         _fetch(wanted, files)
         (solve_number if leads else help_solve_number)(wanted, number, files.progress, sharing)
@@ -157,7 +157,7 @@ def _depth(request: jobs.DepthJob, number: int | None, files: StepFiles) -> None
 
     wanted = _depth_request(request, number, files)
     if number is None:
-        depth(wanted, files.progress)
+        files.tell(depth(wanted, files.progress))
     else:
         depth_number(wanted, number, files.progress)
 
@@ -169,11 +169,11 @@ def _join(request: jobs.SolveJob | jobs.DepthJob, files: StepFiles) -> None:
     if isinstance(request, jobs.SolveJob):
         solving = _solve_request(request, None, files)
         _fetch(solving, files, layout.SOLVED)
-        solve_sequence(solving, files.progress)
+        files.tell(solve_sequence(solving, files.progress))
     else:
         measuring = _depth_request(request, None, files)
         _fetch(measuring, files, layout.SOLVED)
-        depth_sequence(measuring, files.progress)
+        files.tell(depth_sequence(measuring, files.progress))
 
 
 def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tuple[str, ...] = ()) -> None:
@@ -220,7 +220,7 @@ def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> No
     out = files.out
     wanted = files.request(RelightRequest, request, out=str(out / layout.FRAMES))
     for part in _parts(chunk, out) if files.job.is_resumed else [chunk]:
-        relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress)
+        files.tell(relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress))
 
 
 def _parts(chunk: list[int], out: Path) -> Iterator[list[int]]:
@@ -268,6 +268,7 @@ def _register(request: jobs.RegisterJob, files: StepFiles, pieces: JobPieces, *,
             help_register(wanted, files.progress, _sharing(pieces, leads=False))
             return
         done = register_scans(wanted, files.progress, _sharing(pieces, leads=True))
+    files.tell(done)
     _, found = read_scan_set(done.scan_set_path)
     named = {entry.name: entry for entry in scans.scans}
     write_scan_set(found.model_copy(update={"scans": tuple(
@@ -281,7 +282,7 @@ def _fuse(request: jobs.FuseJob, files: StepFiles, pieces: JobPieces, *, leads: 
     _, scans = read_scan_set(files.maps(request.registered) / SCAN_SET_FILE)
     with _linked(scans, files, request.registered) as folder:
         wanted = files.request(FuseRequest, request, scan_set=folder, out=files.out)
-        (fuse if leads else help_fuse)(wanted, files.progress, _sharing(pieces, leads=leads))
+        files.tell((fuse if leads else help_fuse)(wanted, files.progress, _sharing(pieces, leads=leads)))
 
 
 def _sharing(pieces: JobPieces, *, leads: bool) -> "SharedPieces":

@@ -14,7 +14,7 @@ import pytest
 
 from service.client import Client
 from service.requests.relight import RelightOptions
-from tests.scenes.captures import make_scene, write_capture, write_exr
+from tests.scenes.captures import make_scene, write_capture, write_exr, write_radiance
 from tests.service.acquisition.test_acquire import LAMPS, controller, request
 from tests.service.acquisition.test_acquire import stage as stage
 from tests.service.client.conftest import OWL, SKY, Between
@@ -81,6 +81,17 @@ def test_sources_of_all_three_kinds(relit, dome: str, sky: str, tmp_path: Path):
     one, other = [said(relit("submit", "solve", write_capture(tmp_path / place / "ball"), "--method", "lambert").out)["capture"]
                   for place in ("here", "there")]
     assert one == other
+
+
+@pytest.mark.long
+def test_warnings_of_what_a_job_has_made_are_told(relit, dome: str, tmp_path: Path):
+    """Frames have no report: of an environment that is not taken as its header says, nobody heard. Done again, it is said once."""
+    sky = write_radiance(tmp_path / "sky.hdr", np.full((16, 32, 3), 0.5), "GAMMA=2.2")
+    done = relit("submit", "relight", dome, "--environment", sky, "--frames", "1-30", "--wait").well()
+    assert done.count("\nwarning     environment sky.hdr: its header says GAMMA=2.2") == 1
+    with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
+        log = asking.jobs.log(said(done)["job"])
+    assert [f"warning: {each}" for each in log.warnings] == [each.text for each in log.entries if "warning" in each.text]
 
 
 @pytest.mark.long

@@ -121,6 +121,12 @@ export async function remove(path) {
   await send(path, { method: "DELETE" });
 }
 
+/** Return the warnings among the entries of the log of a job. */
+export function warningsIn(entries) {
+  const begin = "warning: ";
+  return entries.filter(({ text }) => text.startsWith(begin)).map(({ text }) => text.slice(begin.length));
+}
+
 /**
  * Return the files of a job's results as a view reads them.
  * @param {string} job Identifier.

@@ -1,6 +1,6 @@
 /** Relit frames of an object: a player over small pictures that the server makes of them, a filmstrip, a video, and the files. */
 
-import { attempt, fetched, listing, Refusal } from "../api.js";
+import { attempt, fetched, listing, read, Refusal, warningsIn } from "../api.js";
 import { bytes, element, icon } from "../element.js";
 import { newest, once } from "../once.js";
 import { savingLink } from "./files.js";
@@ -29,6 +29,7 @@ export async function mountFrames(parent, jobs, nameOf) {
 async function player(place, job, isChosen) {
   const frames = [];
   for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
+  const warnings = warningsIn((await read(`/v1/jobs/${job}/log`)).entries);
   if (!isChosen()) return;
   if (frames.length === 0) throw new Error("this job has no frames any more");
   const canvas = element("canvas", { class: "frames-picture", role: "img", "aria-label": "A relit frame" });
@@ -140,7 +141,8 @@ async function player(place, job, isChosen) {
 
   strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",
     onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
-  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told), element("p", { class: "actions" }, again)), tools, strip, files);
+  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told), element("p", { class: "actions" }, again)),
+    tools, element("ul", { class: "warnings plain" }, ...warnings.map((each) => element("li", {}, each))), strip, files);
   const waiting = frames.map((_, index) => index);
   const loaders = Array.from({ length: PARALLEL }, () => async () => {
     for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next);

@@ -1,6 +1,6 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, load, post, read, resultsOf, save } from "../api.js";
+import { attempt, listing, load, post, read, resultsOf, save, warningsIn } from "../api.js";
 import { byId, bytes, duration, element, show, time } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
@@ -16,6 +16,7 @@ const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
 const SEQUENCE = "sequence.json";
 const asked = newest();
+const warnings = new Set();
 let logged = "";
 let shown = null; // the job as it was told last
 
@@ -59,7 +60,15 @@ async function presentRequest(job) {
 async function log() {
   const isNewest = asked();
   const { entries } = await read(`/v1/jobs/${identifier}/log`);
-  if (isNewest()) byId("log").replaceChildren(...entries.map((entry) => element("li", {}, time(entry.at), ` attempt ${entry.attempt}: ${entry.text}`)));
+  if (!isNewest()) return;
+  byId("log").replaceChildren(...entries.map((entry) => element("li", {}, time(entry.at), ` attempt ${entry.attempt}: ${entry.text}`)));
+  warn(warningsIn(entries));
+}
+
+/** Show warnings beside those that are shown: the log has those of results without a report too. */
+function warn(sentences) {
+  sentences.forEach((sentence) => warnings.add(sentence));
+  byId("warnings").replaceChildren(...[...warnings].map((warning) => element("li", {}, warning)));
 }
 
 async function presentResults(job) {
@@ -92,7 +101,7 @@ function presentReport(report) {
   const stages = Object.entries(report.timings_s ?? report.timings ?? {});
   byId("stages").tBodies[0].replaceChildren(...stages.map(([name, seconds]) => element("tr", {}, element("td", {}, name),
     element("td", {}, typeof seconds === "number" ? seconds.toFixed(2) : String(seconds)))));
-  byId("warnings").replaceChildren(...(report.warnings ?? []).map((warning) => element("li", {}, warning)));
+  warn(report.warnings ?? []);
 }
 
 function offer(id, possible, href) {

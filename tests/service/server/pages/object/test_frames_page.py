@@ -123,6 +123,11 @@ def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
     expect(page.locator(".filmstrip li")).to_have_count(FRAMES)
     expect(page.locator("[data-shows=frames] img")).to_have_count(0)
     expect(page.get_by_label("Frames of").locator("option").first).to_contain_text("<img")
+    with server.client() as client:
+        log = [entry["text"] for entry in client.get(f"/v1/jobs/{relit}/log").json()["entries"]]
+    warnings = [text.removeprefix("warning: ") for text in log if text.startswith("warning: ")]
+    assert any("of the light of frame" in each for each in warnings)  # from where no lamp of the sample stands
+    expect(page.locator("[data-shows=frames] .warnings li")).to_have_text(warnings)
     first = page.evaluate(LOOK)
     page.get_by_role("button", name="Frame 3").click()
     page.get_by_text(f"frame.0003.exr (3 of {FRAMES})").wait_for()
