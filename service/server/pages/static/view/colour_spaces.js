@@ -1,6 +1,6 @@
 /** Scene-linear colour spaces: what a file declares, and conversion between them. */
 
-import { spaces, tolerance } from "./colour_table.js";
+import { spaces, tolerance, undeclared, writtenByOiio } from "./colour_table.js";
 
 const UNITY = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
@@ -28,8 +28,8 @@ export function converted(matrix, [r, g, b]) {
  * @throws {Error} The chromaticities are those of no known space; a sentence.
  */
 export function declaredSpace(header) {
-  if (header.colorInteropID !== undefined) return header.colorInteropID;
-  if (header.chromaticities === undefined) return DISPLAY_SPACE;
+  if (!undeclared.includes(header.colorInteropID ?? undeclared[0])) return header.colorInteropID;
+  if (header.chromaticities === undefined) return writtenByOiio[String(header["oiio:ColorSpace"]).toLowerCase()] ?? DISPLAY_SPACE;
   const given = ["red", "green", "blue", "white"].flatMap((name) => [header.chromaticities[`${name}X`], header.chromaticities[`${name}Y`]]);
   for (const [name, { chromaticities }] of Object.entries(spaces)) {
     if (chromaticities?.every((value, index) => Math.abs(value - given[index]) <= tolerance)) return name;

@@ -1,4 +1,4 @@
-/** Colour spaces by name, and how far declared chromaticities may differ: written by `make colour-table`. */
+/** Colour spaces by name, how far declared chromaticities may differ, and other names: written by `make colour-table`. */
 export const spaces = {
   lin_rec709_scene: {"toRec709": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "chromaticities": [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329]},
   lin_ap1_scene: {"toRec709": [1.705051, -0.621792, -0.083259, -0.130256, 1.140805, -0.010548, -0.024003, -0.128969, 1.152972], "chromaticities": [0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767]},
@@ -8,3 +8,5 @@ export const spaces = {
   lin_adobergb_scene: {"toRec709": [1.398356, -0.398356, 0.0, 0.0, 1.0, 0.0, 0.0, -0.042929, 1.042929], "chromaticities": null},
 };
 export const tolerance = 0.002;
+export const writtenByOiio = {"acescg": "lin_ap1_scene", "lin_ap1": "lin_ap1_scene", "aces2065-1": "lin_ap0_scene", "lin_ap0": "lin_ap0_scene", "lin_rec2020": "lin_rec2020_scene", "lin_p3d65": "lin_p3d65_scene", "srgb": "srgb_texture", "srgb_texture": "srgb_texture"};
+export const undeclared = ["unknown", "data"];

@@ -172,26 +172,27 @@ def aces(server, tmp_path_factory) -> Solved:
 
 
 @pytest.fixture(scope="module")
-def wide_sky(server, tmp_path_factory) -> str:
-    """The sample's environment, its colours made saturated, in ACEScg, which the file declares by chromaticities alone."""
+def wide_skies(server, tmp_path_factory) -> dict[str, str]:
+    """The sample's environment, its colours made saturated, in ACEScg, which files declare by chromaticities alone, or as OpenImageIO 2."""
     channels, _ = exr.read(SAMPLES / "owl" / "environment.exr")
     rgb = np.stack([channels[c] for c in "RGB"], axis=-1) * np.linspace((0.1, 1, 3), (3, 1, 0.1), channels["R"].shape[1])
-    path = write_exr(tmp_path_factory.mktemp("wide") / "wide.exr", rgb @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T,
-                     chromaticities=exr.chromaticities("lin_ap1_scene"))
+    wide, folder = rgb @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T, tmp_path_factory.mktemp("wide")
+    declared = {"solved": {"chromaticities": exr.chromaticities("lin_ap1_scene")}, "aces": {"oiio:ColorSpace": "ACEScg"}}
     with Client(server.url) as client:
-        return client.environments.upload(path).id
+        return {capture: client.environments.upload(write_exr(folder / f"{capture}.exr", wide, **header)).id
+                for capture, header in declared.items()}
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("capture", ["solved", "aces"])
-def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sky, tmp_path, request):
+def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_skies, tmp_path, request):
     """A key light is chosen in the colours of the screen, and maps and captures have colour spaces of their own."""
     shown_capture = request.getfixturevalue(capture)
     page.goto(shown_capture.pages["light"])
     shown_capture.wait_for_content(page, "light")
     page.get_by_label("Size of the light in degrees").fill("10")
     page.locator("input[type=color]").fill("#ff4020")
-    page.get_by_label("Environment map").select_option(wide_sky)
+    page.get_by_label("Environment map").select_option(wide_skies[capture])
     page.locator("canvas.preview").wait_for(timeout=60_000)
     page.get_by_role("button", name="Expose for this light").click()
     shown = picture(page)
