@@ -288,6 +288,7 @@ class Judge:
         Three things tell which of both lamps shone: what the others predict of either, what the picture at either place predicts of its
         neighbours, and that pictures differ the more, the farther apart their lamps are.
         """
+        others = [each for each in others if each.shot.lamp != seen.shot.lamp]  # a plan may light a lamp more than once
         if len(others) < LEAST_LAMPS:
             return None
         differ = 1 - np.array([each.root for each in others]) @ seen.root

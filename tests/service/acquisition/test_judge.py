@@ -12,7 +12,7 @@ from service.requests.acquire import PlanChoices
 from service.twin.camera import OVEREXPOSED
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render
-from tests.service.acquisition.scenes import KINDS, Scene, named, owl, relief, rig_of, shots_on
+from tests.service.acquisition.scenes import KINDS, NoisyCamera, Scene, named, owl, relief, rig_of, shots_on
 
 DIRECTIONS = np.array([[0, 0, 1], [1, 0, 0], [0, 0.6, 0.8], [-1, 0, 0.0]])
 RIG = rig_of(Scene(np.zeros(0), DIRECTIONS))
@@ -64,6 +64,21 @@ def test_the_highlight_of_a_glossy_ball_has_not_moved():
     gloss = 5 * np.maximum(np.einsum("lc,rkc->lrk", half, normal), 0) ** 120 * (lit > 0)
     scene = Scene(np.repeat((0.15 * (lit + gloss))[..., None], 3, axis=-1).astype(np.float32), directions)
     assert named(scene, 1, ()) == ({}, {})
+
+
+def test_a_lamp_that_a_plan_lights_twice_is_no_wrong_lamp():
+    """Each of its pictures is nearer to the other than to all others; half of them were taken again, and named."""
+    cap, directions = make_scene(size=48), fibonacci_sphere(64)
+    directions = directions[directions[:, 2] > 0.2]
+    pictures = render(cap.normal, cap.albedo, directions, np.ones((len(directions), 3)))
+    scene = Scene((pictures / pictures.sum(axis=0).max()).astype(np.float32) * 6, directions)
+    rig, camera, found = rig_of(scene), NoisyCamera(scene, 0), []
+    judge = Judge(rig)
+    for shot in shots_of(plan_of(PlanChoices(plan="olat,olat")), rig, None):
+        pixels = camera.take(shot)
+        found += judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE)
+        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE)
+    assert [*found, *judge.review()] == []
 
 
 def test_lamps_in_front_of_a_matte_cap_without_texture_are_no_ambient_light():
