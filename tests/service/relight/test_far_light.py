@@ -5,7 +5,7 @@ import pytest
 
 from tests.kernels.scenes import cap
 from tests.scenes.captures import rgb, write_exr
-from tests.scenes.glossy import ALBEDO, dome, lat_long, reflect, write_dome, write_maps
+from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 from tests.service.relight.test_clipping import relight
 
 SURFACE = dome(40)
@@ -33,6 +33,14 @@ def patchy():
     return (ALBEDO * (1.05 + 0.55 * np.sin(rows / 3.0) * np.cos(cols / 4.0))[..., None]).astype(np.float32)
 
 
+def ripples() -> dict[str, np.ndarray]:
+    """The normals and the height of another surface, of ripples a dozen pixels wide."""
+    phase = np.broadcast_to(2 * np.pi * np.arange(SURFACE.mask.shape[1]) / 12, SURFACE.mask.shape)
+    normal = np.stack([-np.cos(phase), np.zeros_like(phase), np.ones_like(phase)], axis=-1)
+    return {"normal": (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32),
+            "height": (PIXEL_M * 12 / (2 * np.pi) * np.sin(phase)).astype(np.float32)}
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("beyond")
@@ -47,7 +55,7 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
     another surface explain no captured light, and so change little."""
     folder, truth = scene
     changes = {"nothing": {}, "albedo": {"diffuse_albedo": patchy()},
-               "normals": {"normal": (SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)).astype(np.float32)}}[wrong]
+               "normals": ripples()}[wrong]
     maps = write_maps(tmp_path / "maps", SURFACE, **changes)
     plain = min(SURFACE.off(relight(relit, folder, tmp_path / w, "--weights", w)[0], truth) for w in ("kernel", "cells", "smooth"))
     frame, _ = relight(relit, folder, tmp_path / "guided", "--maps", maps)

@@ -33,6 +33,17 @@ def test_a_height_whose_sign_is_the_other_is_refused(tmp_path):
         read(tmp_path, make_ball(48, height=-BALL.height), BALL.normal)
 
 
+@pytest.mark.parametrize("factor", [1000, 0.001, 2, 1.2])
+def test_a_height_of_another_unit_is_refused(tmp_path, factor):
+    """In millimetres, or twice as steep as its normals; a fifth may be their error."""
+    changed = make_ball(48, height=(factor * BALL.height).astype(np.float32))
+    if factor == 1.2:
+        read(tmp_path, changed, BALL.normal)
+        return
+    with pytest.raises(ResultError, match=r"layer height is [0-9.]+ times as high as layer normal says: give it in metres"):
+        read(tmp_path, changed, BALL.normal)
+
+
 def test_noise_turns_and_what_the_camera_sees_from_near_leave_nothing_to_say(tmp_path):
     """Noise of 10°, lights that are 20° off, and a ball before a perspective camera, whose normals are those of its points."""
     noise = np.random.default_rng(0).normal(0, np.radians(10), BALL.normal.shape)
@@ -52,3 +63,5 @@ def test_noise_turns_and_what_the_camera_sees_from_near_leave_nothing_to_say(tmp
     read(tmp_path, near, normal)
     with pytest.raises(ResultError, match=r"read as \(-X, Y, Z\)"):
         read(tmp_path, near, normal * [-1, 1, 1])
+    with pytest.raises(ResultError, match=r"layer height is -3.* in the median, and its camera has the surface at -0.4 m"):
+        read(tmp_path, replace(near, height=1000 * near.height), normal)
