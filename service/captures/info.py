@@ -319,7 +319,7 @@ def findings(capture: Capture, looked: Grid, recorded: Mapping[str, np.ndarray])
     some = evenly(len(looked.chosen), PIXELS)
     sample = Sample(radiance[:, some], usable[:, some], np.array([light.direction for _, light in lit]),
                     np.array([light.irradiance for _, light in lit]), np.array([frame.exposure_s or 1.0 for frame, _ in lit]),
-                    capture.manifest.color_space)
+                    capture.manifest.color_space, tuple(frame.image for frame, _ in lit))
     fit = fit_manifest(sample)
     if (away := facing_sentence(fit)) is not None:
         return Findings([away], {})

@@ -31,7 +31,7 @@ def sample_of(stack: Stack, capture: Capture, lights: DistantLights, mask: np.nd
     radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     times = {frame.image: frame.exposure_s or 1.0 for frame in capture.sources()}
     exposure = np.array([times[image] for image in stack.frames])
-    return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
+    return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space, tuple(stack.frames))
 
 
 def facing_sentence(fit: Fit) -> str | None:

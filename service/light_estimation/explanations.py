@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.light_estimation.brightness_step import BrightnessStep, find_step
 from service.light_estimation.grey_ball import ENCODINGS, other_readings
 from service.light_estimation.lambertian import (
     LEAST_APART,
@@ -59,6 +60,8 @@ SCALE_ROUNDS, FREE_ROUNDS = 12, 12
 """Rounds of alternating least squares."""
 MEASURED_EVERY = 3
 """Every third pixel suffices to measure the brightness, whose rounds are many."""
+STEP_EVERY = 2
+"""Every second pixel suffices to measure a step of the brightness."""
 STEADY_EVERYWHERE = 0.9
 """Least part of the pixels that reflect light which all images share: it adds to every reading."""
 PLENTY = 60
@@ -72,6 +75,7 @@ class Cause(Enum):
     LINEAR = "the images are linear, and declared display-encoded"
     IRRADIANCE = "the irradiance of the lights is wrong"
     ENCODED_OR_IRRADIANCE = "the images are display-encoded, or the irradiance of the lights is wrong"
+    STEP = "the brightness of the images changes between two of them"
     NORMALISED = "the images are divided by the irradiance already"
     REVERSED = "the lights are in reverse order"
     SHIFTED = "the lights are one frame off"
@@ -93,6 +97,8 @@ class Explanation(NamedTuple):
     """Standard deviation of the logarithm of the brightness that the images ask for."""
     space: str = ""
     """Colour space that would declare the encoding; empty where the encoding is not the cause."""
+    step: BrightnessStep | None = None
+    """The change of brightness, where it is the cause."""
     part: float = 0.0
     """Median of the light that all images share, over that of a lamp which a pixel faces."""
 
@@ -106,6 +112,8 @@ class Sample(NamedTuple):
     irradiance: np.ndarray  # [lights, 3] float64
     exposure: np.ndarray  # [lights] float64: recorded values over radiance
     color_space: str
+    images: tuple[str, ...]
+    """The names of the images."""
 
 
 def fit_manifest(sample: Sample) -> Fit:
@@ -118,6 +126,9 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
     count, misfit = len(sample.directions), given.misfit()
     if count < MIN_LIGHTS or given.spare.sum() < MIN_PIXELS or given.spare.mean() < MIN_PART:
         return None
+    step = _step(sample, given, misfit)
+    if step is not None:
+        return step
     encoding = _encoding(sample, given, misfit)
     order = _order(sample, given, misfit)
     plain = min((found for found in (encoding, order) if found is not None), key=lambda found: found.left, default=None)
@@ -183,6 +194,19 @@ def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
         if _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
     return min(found, key=lambda one: one.left, default=None)
+
+
+def _step(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
+    """Return a brightness that changes between two images, if the images ask for it."""
+    few = slice(None, None, STEP_EVERY)
+    readings = grey_readings(sample.radiance, sample.irradiance)
+    part = Fit(given.vector[:, few], given.residual[:, few], given.lit[:, few])
+    step = find_step(readings[:, few], sample.usable[:, few], sample.directions, part)
+    if step is None:
+        return None
+    factors = step.factors(len(readings))
+    fit = fit_lambertian(readings / factors[:, None], sample.usable, sample.directions)
+    return Explanation(Cause.STEP, misfit, fit.misfit(), _angle(given, fit), float(np.log(factors).std()), step=step)
 
 
 def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
@@ -287,6 +311,10 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
     fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
     alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
     measure = "`relit calibrate intensity` measures it"
+    if found.step is not None:
+        return (f"frames[].light.irradiance: from {sample.images[found.step.first]} on, all images look {found.step.factor:.2g} times as "
+                f"bright as declared beside those before it, as where exposure, gain or lamps changed there; give exposure_s, or the "
+                f"irradiance of these lights ({measure})")
     return {
         Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as "
                        f"{ENCODINGS.get(found.space)}, {fits}; declare {found.space} if they are",

@@ -106,7 +106,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
         found = better_explanation(sample, fit)
         estimated = lights is not declared
         if found is not None:
-            repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.NORMALISED)
+            repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.STEP, Cause.NORMALISED)
             solution.warnings.append(explanation_sentence(found, sample) + (REPAIRED if repaired else ""))
             if not repaired:
                 raise_error(solution, found.degrees)
@@ -115,7 +115,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
         asked = estimated or solution.facts.get("light_intensities", {}).get("left_out_gain", 0.0) >= LEAST_ASKED
         if asked and not is_linear(capture.manifest.color_space):
             _hold_adapted(given, sample, solution)
-        other = find_other_lights(given, lights) if found is None or found.cause is Cause.IRRADIANCE else None
+        other = find_other_lights(given, lights) if found is None or found.cause in (Cause.IRRADIANCE, Cause.STEP) else None
         if other is not None:
             solution.warnings.append(other.sentence)
             raise_error(solution, other.degrees)

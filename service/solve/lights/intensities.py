@@ -17,6 +17,7 @@ import numpy as np
 
 from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.light_factors import untold
+from service.light_estimation.brightness_step import find_step
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import LEAST_APART, fit_lambertian
 from service.light_estimation.semi_calibrated import fit_grey_intensities, part_uncertainty, shades_alike
@@ -73,13 +74,28 @@ class ChosenIntensities(NamedTuple):
 
 
 def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntensities:
-    """Return the lights with the declared intensities, or with those that the images ask for."""
+    """Return the lights with the declared intensities, or with those that the images ask for. Where all images from one on are brighter
+    or darker, they ask for that first: two numbers, of which surfaces that are not Lambertian spoil little."""
     if len(lights.direction) < LEAST_LIGHTS:
         return _declared(lights, f"fewer than {LEAST_LIGHTS} lights")
     inside = np.flatnonzero(given.mask)
     pixels = inside[evenly(len(inside), PIXELS)]
     radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance, lights.irradiance)
+    step = find_step(readings, usable, lights.direction, fit_lambertian(readings, usable, lights.direction))
+    if step is None:
+        return _chosen(given, lights, pixels, readings, usable)
+    factors = step.factors(len(readings))
+    stepped = lights._replace(irradiance=lights.irradiance * factors[:, None])
+    chosen = _chosen(given, stepped, pixels, readings / factors[:, None], usable)
+    found = chosen.facts["light_intensities"]
+    return ChosenIntensities(chosen.lights, {"light_intensities": {
+        **found, "used": "estimated", "factors": (factors * np.array(found.get("factors", 1.0))).round(4).tolist(),
+        "step": {"first": given.stack.frames[step.first], "factor": round(step.factor, 4)}}})
+
+
+def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readings: np.ndarray, usable: np.ndarray) -> ChosenIntensities:
+    """Return the lights with the intensities that readings [lights, pixels] of some pixels ask for, or as they are."""
     place = np.stack(np.divmod(pixels, given.mask.shape[1])).astype(np.float64)
     place -= place.min(axis=1, keepdims=True)
     row, col = np.floor(place * SQUARES / (place.max() + 1)).astype(int)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.light_estimation.explanations import Sample, better_explanation, fit_manifest
+from service.light_estimation.explanations import Cause, Sample, better_explanation, explanation_sentence, fit_manifest
 from service.light_estimation.lambertian import FACING
 from stage.transforms import fibonacci_sphere
 from tests.reference.microfacet import specular, unit
@@ -14,7 +14,8 @@ VIEW = np.array([0.0, 0.0, 1.0])
 def sample_of(readings, lights):
     """Grey readings [lights, pixels] under lights of irradiance 1."""
     count = len(lights)
-    return Sample(np.repeat(readings[..., None], 3, axis=2), readings > 0, lights, np.ones((count, 3)), np.ones(count), "lin_rec709_scene")
+    return Sample(np.repeat(readings[..., None], 3, axis=2), readings > 0, lights, np.ones((count, 3)), np.ones(count), "lin_rec709_scene",
+                  tuple(f"{number:03d}.exr" for number in range(count)))
 
 
 @pytest.mark.parametrize("ball", [60, 100])
@@ -55,3 +56,37 @@ def test_what_fits_beside_metal_tells_that_axes_are_right():
     metal = np.where(away > 0, away * np.exp(1.2 * draw.normal(size=away.shape)), 0)
     fit = fit_manifest(sample_of(np.concatenate([matt, metal], axis=1), lights))
     assert fit.facing < FACING and fit.towards_camera is None
+
+
+@pytest.mark.parametrize(("first", "factor"), [(12, 0.5), (18, 1.5), (12, 0.8)])
+@pytest.mark.parametrize("gloss", [0.0, 0.3])
+def test_an_exposure_that_changes_is_named_with_its_image(first, factor, gloss):
+    """Readings of a matt and a glossy ball, of 1 % noise, whose images are brighter or darker from one on."""
+    readings, lights = ball(gloss)
+    readings[first:] *= factor
+    sample = sample_of(readings, lights)
+    found = better_explanation(sample, fit_manifest(sample))
+    assert found.cause is Cause.STEP and found.step.first == first
+    assert abs(found.step.factor / factor - 1) < 0.03  # noise makes .005, gloss the rest
+    assert f"from {first:03d}.exr on, all images look {found.step.factor:.2g} times as bright" in explanation_sentence(found, sample)
+
+
+@pytest.mark.parametrize("change", [np.ones(24), np.exp(0.2 * np.random.default_rng(4).normal(size=24)), np.linspace(0.7, 1.3, 24),
+                                    np.where(np.arange(24) == 20, 0.4, 1.0)])
+def test_lights_that_differ_are_no_step(change):
+    """Equal lights, single ones, lamps that fade, and one that is dim."""
+    readings, lights = ball(0.1)
+    sample = sample_of(readings * change[:, None], lights)
+    found = better_explanation(sample, fit_manifest(sample))
+    assert found is None or found.cause is not Cause.STEP
+
+
+def ball(gloss):
+    """Readings of a ball of an albedo that varies, under 24 lights in an order that follows no direction."""
+    draw = np.random.default_rng(6)
+    lights = fibonacci_sphere(80)
+    lights = draw.permutation(lights[lights[:, 2] > 0.4][:24])
+    normal = unit(draw.normal(size=(2400, 3)) * [1, 1, 0] * draw.uniform(0, 1, (2400, 1)) + [0, 0, 0.7])[:600]
+    matt = draw.uniform(0.2, 0.7, 600) / np.pi * np.maximum(lights @ normal.T, 0)
+    readings = matt + gloss * np.stack([specular(normal, light, VIEW, 0.3, 0.2) for light in lights])
+    return readings * (1 + 0.01 * draw.normal(size=readings.shape)), lights

@@ -184,7 +184,8 @@ def test_lights_that_few_pixels_see_are_not_judged():
 def sample(count=16, every=5, **changes):
     scene = ellipsoid(count=count)
     given = Sample(scene.images[:, scene.mask][:, ::every], np.ones((count, len(scene.images[0, scene.mask][::every])), bool),
-                   scene.directions, scene.irradiance, np.ones(count), "lin_rec709_scene")
+                   scene.directions, scene.irradiance, np.ones(count), "lin_rec709_scene",
+                   tuple(f"{number:03d}.exr" for number in range(count)))
     return given._replace(**changes)
 
 

@@ -30,7 +30,7 @@ def test_only_adapted_images_are_mended_by_a_power_of_the_brightness_around(tmp_
     places = np.stack(np.mgrid[:SIZE:4, :SIZE:4], axis=-1).reshape(-1, 2)
     light = change(np.stack([correction.apply(frame).pixels for frame in frames]))[:, places[:, 0], places[:, 1]]
     sample = Sample(light, light.max(axis=-1) < 0.99, np.array([frame.light.direction for frame in frames]), np.full((10, 3), np.pi),
-                    np.ones(10), "srgb_texture")
+                    np.ones(10), "srgb_texture", tuple(frame.image for frame in frames))
     assert (find_adapted(sample, places) is not None) == found
 
 

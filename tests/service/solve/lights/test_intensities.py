@@ -169,3 +169,14 @@ def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_t
     over_sigma, error, report = solved_scene(tmp_path / "cap", normal, gloss * highlight(normal, directions), factor, directions)
     assert report["found"]["light_intensities"]["used"] == ("estimated" if wrong else "declared")
     assert np.percentile(over_sigma, 99) < 5 and (gloss or np.median(error) < 0.3), np.median(error)
+
+
+def test_an_exposure_that_changed_is_undone(tmp_path):
+    """Half of the images of a rough cap, which asks for other lights too, are of half the exposure: normals are as without."""
+    factor = np.where(np.arange(LIGHTS) < LIGHTS // 2, 1.0, 0.5)
+    error, report = solved(tmp_path / "changed", factor, rough=0.9)
+    right, _ = solved(tmp_path / "right", np.ones(LIGHTS), rough=0.9)
+    assert report["found"]["light_intensities"]["step"]["first"] == "020.exr"
+    assert np.median(error) < 1.2 * np.median(right) + 0.05  # the step is known to .5 %
+    assert any(warning.startswith("frames[].light.irradiance: from 020.exr on, all images look 0.5 times as bright")
+               for warning in report["warnings"])
