@@ -24,7 +24,8 @@ from service.light_estimation.lambertian import (
     median_of,
     unlike_most,
 )
-from service.light_estimation.semi_calibrated import TINY, fit_intensities
+from service.light_estimation.neighbours import IN_ORDER, MIN_LIGHTS_SMOOTH, SMOOTH, in_order
+from service.light_estimation.semi_calibrated import ROUND, TINY, fit_intensities, told_by_relief
 from stage.colour.colour import GREY_WEIGHTS
 from stage.colour.colour_spaces import is_linear
 from stage.errors import CalibrationError
@@ -66,6 +67,7 @@ STEADY_EVERYWHERE = 0.9
 """Least part of the pixels that reflect light which all images share: it adds to every reading."""
 PLENTY = 60
 """Least count of pixels, seen by most lights, from which free directions are started."""
+
 
 
 class Cause(Enum):
@@ -141,8 +143,12 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
         return brightness._replace(cause=Cause.ENCODED_OR_IRRADIANCE, degrees=max(brightness.degrees, encoding.degrees),
                                    space=encoding.space)
     free = _free_directions(sample, given) if count >= MIN_LIGHTS_FREE else None
-    steady = None if free is None else _steady_light(sample, given, free)
-    return steady or free
+    if free is None:
+        return None
+    if (steady := _steady_light(sample, given, free)) is not None:
+        return steady
+    of_a_coin = given.apart.mean() < ROUND and in_order(grey_readings(sample.radiance, sample.irradiance), sample.directions, IN_ORDER)
+    return None if of_a_coin else free
 
 
 def _explains(left: float, misfit: float, times: float) -> bool:
@@ -232,6 +238,9 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
     apart = free.apart  # under the declared brightness, normals of a metal plane seem to differ
     if apart.sum() >= LEAST_APART and given.misfit(apart) < TIMES_FREE * free.misfit(apart):
         return None
+    smooth = len(factor) >= MIN_LIGHTS_SMOOTH and in_order(np.log(factor)[:, None], sample.directions, SMOOTH)
+    if smooth and free.apart.mean() < ROUND and not told_by_relief(readings, sample.usable, sample.directions, factor, left):
+        return None  # highlights of a coin look like lights of other strengths
     # the alternation stops half-way: enough to see that brightness explains the images, but not how far the normals are off
     try:
         few = slice(None, None, MEASURED_EVERY)

@@ -38,6 +38,8 @@ LEAST_APART = 20
 SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
 """A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
 lights."""
+CAST = -0.7
+"""A reading that is so far below the level of its pixel, relative to it, lies in a cast shadow, unless most of the light's do."""
 
 FACING, FACING_INSTEAD = 0.8, 0.83
 """Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes: 0.85 of objects
@@ -172,7 +174,10 @@ class Suspect(NamedTuple):
 
 
 def suspects(readings: np.ndarray, directions: np.ndarray, normal: np.ndarray) -> list[Suspect]:
-    """Return the lights that disagree with the others, worst first.
+    """Return the lights that disagree with the others, worst first; none on metal, of which all do.
+
+    Highlights of the side that most pixels share look like a wrong light: what faces otherwise must disagree too, and where nothing does a
+    brighter light is none. Cast shadows are left out.
     `readings`: [lights, pixels] grey radiance over irradiance. `normal`: [3, pixels] unit normals that were found under these lights."""
     cosine = directions @ normal
     seen = (cosine > LEAST_COSINE) & (directions[:, 2:] > LEAST_TOWARDS)
@@ -182,6 +187,17 @@ def suspects(readings: np.ndarray, directions: np.ndarray, normal: np.ndarray) -
     if not len(judged):
         return []
     level = np.maximum(np.nanmedian(ratio[:, lit], axis=0), 1e-12)
-    misfit = np.nanmedian(np.abs(ratio[np.ix_(judged, lit)] / level - 1), axis=1)
+    off = ratio[np.ix_(judged, lit)] / level - 1
+    dark = (off < CAST) & (np.nanmedian(off, axis=1, keepdims=True) > CAST)
+    off[dark] = np.nan
+    misfit = np.nanmedian(np.abs(off), axis=1)
     limit = max(SUSPECT_OFF, SUSPECT_TIMES * float(np.median(misfit)))
-    return [Suspect(int(judged[i]), float(misfit[i])) for i in np.argsort(-misfit) if misfit[i] > limit]
+    if np.median(misfit) > SUSPECT_OFF:
+        return []
+    apart = unlike_most(normal[:, lit], SIDE)
+
+    def disagrees(light: np.ndarray) -> bool:
+        told = np.abs(light[apart & np.isfinite(light)])
+        return bool(np.median(told) > limit if len(told) >= LEAST_APART else np.nanmedian(light) < 0)
+
+    return [Suspect(int(judged[i]), float(misfit[i])) for i in np.argsort(-misfit) if misfit[i] > limit and disagrees(off[i])]

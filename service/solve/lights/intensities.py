@@ -20,7 +20,7 @@ from kernels.photometric.search.light_factors import untold
 from service.light_estimation.brightness_step import find_step
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import LEAST_APART, fit_lambertian
-from service.light_estimation.semi_calibrated import fit_grey_intensities, part_uncertainty, shades_alike
+from service.light_estimation.semi_calibrated import ROUND, fit_grey_intensities, told_by_relief
 from service.solve.base.solution import SolveInput
 from stage.capture.point_lights import DistantLights
 from stage.errors import CalibrationError
@@ -43,10 +43,6 @@ UNEXPLAINED_APART = "others do not explain what faces otherwise than most of the
 TIMES_APART = 1.5
 """Most that they may leave of pixels that face otherwise than most, over what they leave of all: 1.1 on ten objects under wrong lights,
 and 2 to 6 of a ball before a glossy wall."""
-ROUND, RELIEF_TIMES = 0.65, 2.5
-"""Part of the pixels that face otherwise than most, below which the relief of an object must tell the intensities; and their spread over
-their uncertainty, from which on it does: 0.9 to 2.3 of highlights on relief of 1 to 8 degrees under right lights, 7 to 150 of matt relief
-under wrong ones, 3 and more of glossy relief and folds under lights that are wrong by a third."""
 LARGEST_LEFT = 0.05
 """Largest misfit that other intensities may leave, relative to |b|: bare metal leaves more under any intensities."""
 LARGEST_FALL = 0.1
@@ -129,20 +125,11 @@ def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readin
         return _declared(lights, "no intensities explain the images by diffuse reflection", gain)
     if judged_apart and estimated.misfit(apart) > max(TIMES_APART * after, NOISE):
         return _declared(lights, UNEXPLAINED_APART, gain)
-    if estimated.apart.mean() < ROUND and not _told_by_relief(readings, usable, lights.direction, factor, after):
+    if estimated.apart.mean() < ROUND and not told_by_relief(readings, usable, lights.direction, factor, after):
         return _declared(lights, "most of the object faces one way, where highlights look like lights of other strengths", gain)
     facts = {"used": "estimated", "left_out_gain": round(gain, 4), "misfit_declared": round(declared.misfit(), 4),
              "misfit_estimated": round(after, 4), "spread": round(float(np.log(factor).std()), 4), "factors": factor.round(4).tolist()}
     return ChosenIntensities(lights._replace(irradiance=lights.irradiance * factor[:, None]), {"light_intensities": facts})
-
-
-def _told_by_relief(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, factor: np.ndarray, misfit: float) -> bool:
-    """Return whether the relief of a flat object tells the intensities: its parts, by how they face the viewer, ask for the same ones, and
-    would not if they were highlights."""
-    if shades_alike(readings, usable, misfit):
-        return False
-    sigma = part_uncertainty(np.repeat(readings[..., None], 3, axis=2), usable, directions, np.repeat(factor[:, None], 3, axis=1))
-    return float(np.log(factor).std()) > RELIEF_TIMES * float(np.median(sigma))
 
 
 def lambertian_misfit(given: SolveInput, lights: DistantLights) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.light_estimation.explanations import Cause, Sample, better_explanation, explanation_sentence, fit_manifest
-from service.light_estimation.lambertian import FACING
+from service.light_estimation.lambertian import FACING, suspects
 from stage.transforms import fibonacci_sphere
 from tests.reference.microfacet import specular, unit
 
@@ -90,3 +90,43 @@ def ball(gloss):
     matt = draw.uniform(0.2, 0.7, 600) / np.pi * np.maximum(lights @ normal.T, 0)
     readings = matt + gloss * np.stack([specular(normal, light, VIEW, 0.3, 0.2) for light in lights])
     return readings * (1 + 0.01 * draw.normal(size=readings.shape)), lights
+
+
+def coin(roughness, dielectric, count=40):
+    """Readings of a coin with relief of some degrees, glossy or of metal, under frontal lights, and these."""
+    draw = np.random.default_rng(2)
+    lights = fibonacci_sphere(4 * count)
+    lights = lights[lights[:, 2] > 0.5][:count]
+    normal = unit(draw.normal(size=(600, 3)) * [0.06, 0.06, 0] + [0, 0, 1])
+    readings = np.stack([specular(normal, light, VIEW, roughness, 0.04 if dielectric else 0.6) for light in lights])
+    readings += dielectric * 0.1 / np.pi * np.maximum(lights @ normal.T, 0)
+    return readings * (1 + 0.005 * draw.normal(size=readings.shape)), lights
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5])
+@pytest.mark.parametrize("dielectric", [True, False])
+def test_a_coin_whose_highlight_is_smooth_over_the_lights_is_accused_of_nothing(roughness, dielectric):
+    readings, lights = coin(roughness, dielectric)
+    sample = sample_of(readings, lights)
+    fit = fit_manifest(sample)
+    assert better_explanation(sample, fit) is None
+    assert suspects(readings, lights, fit.normal) == []
+    mixed = sample_of(readings, np.random.default_rng(1).permutation(lights))
+    assert better_explanation(mixed, fit_manifest(mixed)) is not None
+    uneven = sample_of(readings * np.exp(0.3 * np.random.default_rng(1).normal(size=len(lights)))[:, None], lights)
+    assert not dielectric or better_explanation(uneven, fit_manifest(uneven)) is not None  # bare metal hides it
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_highlight_of_a_wall_is_no_wrong_light_and_one_light_of_another_strength_is(factor):
+    """A glossy wall behind a matt ball: the ball contradicts that the light in whose mirror the wall lies is another."""
+    draw = np.random.default_rng(3)
+    lights = fibonacci_sphere(60)
+    lights = lights[lights[:, 2] > 0.45][:16]
+    wall, around = unit(np.tile([0.1, 0.1, 1.0], (400, 1))), unit(draw.normal(size=(200, 3)) * [0.5, 0.5, 0] + [0, 0, 1])
+    readings = np.maximum(lights @ np.concatenate([wall, around]).T, 0)
+    readings[:, :400] += np.stack([specular(wall, light, VIEW, 0.3, 0.2) for light in lights])
+    normal = np.concatenate([wall, around]).T
+    assert suspects(readings, lights, normal) == []
+    readings[5] *= factor
+    assert [found.light for found in suspects(readings, lights, normal)] == [5]
