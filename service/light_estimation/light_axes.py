@@ -119,9 +119,11 @@ def light_axes(matrices: tuple[np.ndarray, ...], found: Axes) -> LightAxes:
     """Return the fault that one of several matrices [3, 3] corrects."""
     ways = ", or ".join(describe(matrix) for matrix in matrices)
     kind = "mirrored" if np.linalg.det(matrices[0]) < 0 else "turned"
+    odd = kind == "turned" and np.abs(matrices[0] - np.round(matrices[0])).max() > 1e-6  # by no right angle
+    shifted = ", that lights which follow each other around the object are not one image off" if odd else ""
     return LightAxes(f"the axes look {kind}: with {ways}, the slopes of the surface are those of one height to {100 * found.left:.0f} %, "
                      f"as declared to {100 * found.misfit:.0f} % (25 % is no order at all); check the axes (x right, y up, z towards the "
-                     "camera), and that no image is flipped", matrices)
+                     f"camera){shifted}, and that no image is flipped", matrices)
 
 
 def describe(matrix: np.ndarray) -> str:

@@ -48,6 +48,15 @@ def test_axes_under_which_the_normals_are_of_no_surface_that_stands_free_are_nam
         assert said == [] if words is None else len(said) == 1 and words in said[0]
 
 
+def test_lights_of_a_spiral_that_are_one_image_off_are_named(tmp_path):
+    """Each is then turned by the golden angle, and all readings fit as well as under the right ones."""
+    scene = ellipsoid(count=24)
+    spiral, equal = scene.directions[np.argsort(-scene.directions[:, 2])], np.ones((24, 3))
+    scene = scene._replace(directions=spiral, irradiance=equal, images=render(scene.normal, scene.albedo, spiral, equal))
+    for said in declared(tmp_path / "capture", lambda directions: np.roll(directions, 1, axis=0), scene):
+        assert len(said) == 1 and "one image off" in said[0]
+
+
 def test_lights_in_another_order_are_named(tmp_path):
     for said in declared(tmp_path / "capture", lambda directions: np.random.default_rng(0).permutation(directions)):
         assert len(said) == 1 and "images and directions do not belong together" in said[0]
