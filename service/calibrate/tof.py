@@ -59,10 +59,9 @@ MOST_SCATTER = 0.15
 """Scatter of the errors of ranges, as a part of what the highest frequency tells apart, beyond which no wiggling makes them."""
 MOST_WRONG = 0.2
 """Largest part of the steps that is left out."""
-LEAST_OFF_PLANE = 0.02
-"""Part of the readings off the plane of the target from which on they are said; noise leaves a thousandth."""
-LEAST_SEEN = 0.03
-"""Least part of the pixels of a step at its distance that is a target: other things pass all distances by less."""
+LEAST_OFF_PLANE, LEAST_SEEN = 0.02, 0.03
+"""Part of the readings off the plane of the target from which on they are said, of which noise leaves a thousandth; and least part of the
+pixels of a step at its distance that is a target: other things pass all distances by less."""
 MOST_REPEATS = 10
 """Distances in ranges after which phases repeat beyond which pixels are at any distance by chance: they are in another unit."""
 FALLING = 0.8
@@ -177,13 +176,12 @@ def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibrat
             raise RequestError(f"{capture.folder}: no pixel of this step is solved{given}: "
                                f"{'; '.join(told or solved.warnings) or 'check its frames and its mask'}")
         right = _true_half_path(step, capture)[solved.solved]
+        true.append(float(np.median(right)))
         off = _half_path(solved.range_m.astype(np.float64), capture)[solved.solved] - right
         errors.append(float(np.median(off)))
-        true.append(float(np.median(right)))
         some.append(off[evenly(len(off), STEP_PIXELS)])
         hz |= {frame.tof.modulation_hz for frame in capture.manifest.frames if isinstance(frame.tof, ContinuousWave)}
-    repeat_m = common_range_m(sorted(hz), SPEED_OF_LIGHT) if hz else None
-    found = np.array(errors)
+    repeat_m, found = common_range_m(sorted(hz), SPEED_OF_LIGHT) if hz else None, np.array(errors)
     if repeat_m is not None:  # a target beyond what the frequencies tell apart is as good as another
         usual = float(np.angle(np.exp(2j * np.pi / repeat_m * found).sum())) / (2 * np.pi) * repeat_m
         found -= repeat_m * np.round((found - usual) / repeat_m)

@@ -179,8 +179,8 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "name", capture.name
     yield "folder", str(capture.folder)
     measured = isinstance(manifest.projector, Projector) or any(frame.laser or frame.tof or frame.stereo for frame in manifest.frames)
-    scale = (f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else
-             "depths in metres" if measured else "no scale")
+    unit = "depths in metres" if measured else "no scale"
+    scale = f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else unit
     yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
     working = linear_space(manifest.color_space)
     yield "colour", manifest.color_space + ("" if working == manifest.color_space else f", worked on in {working}")

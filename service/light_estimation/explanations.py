@@ -69,7 +69,6 @@ PLENTY = 60
 """Least count of pixels, seen by most lights, from which free directions are started."""
 
 
-
 class Cause(Enum):
     """The fault of the manifest."""
 

@@ -295,13 +295,11 @@ def test_what_the_calibration_leaves_open_is_said_again(relit, tmp_path):
     """A depth whose scale is known to 2 % was joined to hundredths of a millimetre without a word."""
     solved, depth, z, _ = write(tmp_path)
     for shared, said in ((0.02 * abs(float(np.median(z))), True), (1e-6, False)):
-        maps = DepthMaps.read(depth / "depth.exr")
-        replace(maps, provenance={CALIBRATION_SIGMA: f"{shared:g}"}).write(depth / "depth.exr")
+        replace(DepthMaps.read(depth / "depth.exr"), provenance={CALIBRATION_SIGMA: f"{shared:g}"}).write(depth / "depth.exr")
         relit.done("join", solved, depth, "--out", tmp_path / "joined")
         report = json.loads((tmp_path / "joined" / "report.json").read_text())
         assert report["calibration_sigma_m"] == pytest.approx(shared, rel=1e-5)
-        words = f"depth: its calibration leaves {shared:.3g} m open of all depths together"
-        assert any(each.startswith(words) for each in report["warnings"]) == said
+        assert any(each.startswith(f"depth: its calibration leaves {shared:.3g} m open") for each in report["warnings"]) == said
 
 
 def test_an_asset_is_made_of_it(relit, tmp_path):
