@@ -189,8 +189,7 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
         orientation = images.read_header(capture.file(manifest.frames[0].image)).orientation
         if orientation != UPRIGHT:
             yield "orientation", f"{TURNS[orientation].words}, as EXIF orientation {orientation} of every frame says"
-    kinds = Counter(_kind(frame) for frame in manifest.frames)
-    yield "frames", ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    yield "frames", ", ".join(f"{count} {kind}" for kind, count in Counter(map(_kind, manifest.frames)).items())
     given = [name for name in ("dark", "flat", "mask", "saturation", "projector") if getattr(manifest, name) is not None]
     if manifest.frames[0].exposure_s is not None:
         given.append("exposure_s")
