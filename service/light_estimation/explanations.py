@@ -238,7 +238,7 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
     if apart.sum() >= LEAST_APART and given.misfit(apart) < TIMES_FREE * free.misfit(apart):
         return None
     smooth = len(factor) >= MIN_LIGHTS_SMOOTH and in_order(np.log(factor)[:, None], sample.directions, SMOOTH)
-    if smooth and free.apart.mean() < ROUND and not told_by_relief(readings, sample.usable, sample.directions, factor, left):
+    if smooth and free.apart.mean() < ROUND and not told_by_relief(readings, sample.usable, sample.directions, factor, free, given):
         return None  # highlights of a coin look like lights of other strengths
     # the alternation stops half-way: enough to see that brightness explains the images, but not how far the normals are off
     try:

@@ -17,6 +17,7 @@ from service.light_estimation.grey_ball import WEIGHT_SCALE
 from service.light_estimation.lambertian import (
     BRIGHT_END,
     SHADOW,
+    Fit,
     bright_readings,
     fit_lambertian,
     least_squares,
@@ -61,6 +62,10 @@ ROUND, RELIEF_TIMES = 0.65, 2.5
 """Part of the pixels that face otherwise than most, below which the relief of an object must tell the intensities; and their spread over
 their uncertainty, from which on it does: 0.9 to 2.3 of highlights on relief of 1 to 8 degrees under right lights, 7 to 150 of matt relief
 under wrong ones, 3 and more of glossy relief and folds under lights that are wrong by a third."""
+ENOUGH_APART, FAR_BETTER = 0.2, 4.0
+"""Part of the pixels that face otherwise than most under either strength of the lights, and the factor by which the strengths lower their
+misfit, from which on they tell these: 1.8 of glossy relief of five degrees under right lights, 10 of an ellipsoid before a wall under wrong
+ones."""
 TINY = 1e-200
 """A number below any reading, which avoids division by zero."""
 
@@ -139,10 +144,15 @@ def shades_alike(readings: np.ndarray, usable: np.ndarray, misfit: float) -> boo
     return MAD_TO_SIGMA * float(np.median(off)) < ALIKE * misfit
 
 
-def told_by_relief(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, factor: np.ndarray, misfit: float) -> bool:
+def told_by_relief(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, factor: np.ndarray, fit: Fit, declared: Fit) -> bool:
     """Return whether the relief of a flat object tells the intensities: its parts, by how they face the viewer, ask for the same ones, and
-    would not if they were highlights. `factor`: [lights], that grey readings [lights, pixels] ask for, which then leave `misfit`."""
-    if shades_alike(readings, usable, misfit):
+    would not if they were highlights. Where enough faces otherwise than most and is far better explained, as a body before a wall, it
+    tells them unless it shades alike. `factor`: [lights], that grey readings [lights, pixels] ask for. `fit`, `declared`: under these and
+    under the declared ones."""
+    apart = fit.apart & declared.apart  # highlights make normals of flat relief differ under other strengths
+    if apart.mean() >= ENOUGH_APART and declared.misfit(apart) > FAR_BETTER * fit.misfit(apart):
+        return not shades_alike(readings[:, apart], usable[:, apart], fit.misfit(apart))
+    if shades_alike(readings, usable, fit.misfit()):
         return False
     sigma = part_uncertainty(np.repeat(readings[..., None], 3, axis=2), usable, directions, np.repeat(factor[:, None], 3, axis=1))
     return float(np.log(factor).std()) > RELIEF_TIMES * float(np.median(sigma))

@@ -125,7 +125,7 @@ def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readin
         return _declared(lights, "no intensities explain the images by diffuse reflection", gain)
     if judged_apart and estimated.misfit(apart) > max(TIMES_APART * after, NOISE):
         return _declared(lights, UNEXPLAINED_APART, gain)
-    if estimated.apart.mean() < ROUND and not told_by_relief(readings, usable, lights.direction, factor, after):
+    if estimated.apart.mean() < ROUND and not told_by_relief(readings, usable, lights.direction, factor, estimated, declared):
         return _declared(lights, "most of the object faces one way, where highlights look like lights of other strengths", gain)
     facts = {"used": "estimated", "left_out_gain": round(gain, 4), "misfit_declared": round(declared.misfit(), 4),
              "misfit_estimated": round(after, 4), "spread": round(float(np.log(factor).std()), 4), "factors": factor.round(4).tolist()}
