@@ -1,8 +1,8 @@
 """Whether all images from one on are brighter or darker by one factor: exposure, gain or lamps that changed while the capture was taken.
 
 The brightness that the images ask for (service.light_estimation.semi_calibrated) then has a step in their order, beside a smooth part that
-follows the angle to the viewer, as surfaces ask for that are not Lambertian. A step has two numbers, where the brightness of each light has
-one a light: it is found where these explain no more than the reflectance of the object.
+follows the angle to the viewer, as surfaces ask for that are not Lambertian. A step has two numbers, where a brightness of its
+own has one for each light: so surfaces that are not Lambertian, which ask for wrong lights too, spoil it little.
 """
 
 from typing import NamedTuple

@@ -57,8 +57,8 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
             break
         materials.append(index)
         best = np.minimum(best, costs[index])
-    return _with_one_f0(samples, normal, *_settle_roughness(samples, normal, candidates[materials].astype(np.float32), costs[materials],
-                                                            shape=shape), shape=shape)
+    settled, least = _settle_roughness(samples, normal, candidates[materials].astype(np.float32), costs[materials], shape=shape)
+    return _with_one_f0(samples, normal, settled, least, shape=shape)
 
 
 def _settle_roughness(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *,
