@@ -67,12 +67,17 @@ def unused_exposures(exposures: Mapping[str, Exposure]) -> list[str]:
             "\"exposure_from\": \"exif\" the readings are divided by these times"]
 
 
-def radiance_multiplier(file: BinaryIO) -> float:
-    """Return the factor that a Radiance file says its values were multiplied by; 1 where it says none. Leaves the file at its beginning."""
+def _radiance_header(file: BinaryIO) -> bytes:
+    """Return the lines of a Radiance header; empty where it does not end in time. Leaves the file at its beginning."""
     file.seek(0)
     header, end, _ = file.read(RADIANCE_HEADER_BYTES).partition(b"\n\n")
     file.seek(0)
-    factors = re.findall(rb"^EXPOSURE=\s*([0-9.eE+-]+)\s*$", header, re.MULTILINE) if end else []
+    return header if end else b""
+
+
+def radiance_multiplier(file: BinaryIO) -> float:
+    """Return the factor that a Radiance file says its values were multiplied by; 1 where it says none. Leaves the file at its beginning."""
+    factors = re.findall(rb"^EXPOSURE=\s*([0-9.eE+-]+)\s*$", _radiance_header(file), re.MULTILINE)
     try:
         return sound(math.prod(map(float, factors))) or 1.0
     except ValueError:  # no number
@@ -82,11 +87,8 @@ def radiance_multiplier(file: BinaryIO) -> float:
 def radiance_encoding(file: BinaryIO) -> str:
     """Return the lines of a Radiance header that say its values are not linear ones of Rec.709; empty where it has none. Leaves the file at
     its beginning."""
-    file.seek(0)
-    header, end, _ = file.read(RADIANCE_HEADER_BYTES).partition(b"\n\n")
-    file.seek(0)
     found = []
-    for name, numbers in re.findall(rb"^(GAMMA|COLORCORR|PRIMARIES)=([-+.0-9eE \t]+)$", header, re.MULTILINE) if end else []:
+    for name, numbers in re.findall(rb"^(GAMMA|COLORCORR|PRIMARIES)=([-+.0-9eE \t]+)$", _radiance_header(file), re.MULTILINE):
         try:
             values = [float(number) for number in numbers.split()]
         except ValueError:  # no number

@@ -28,7 +28,7 @@ NEAR = 0.3
 
 
 def normal_fault(camera: Camera, mask: np.ndarray, normal: np.ndarray, height: np.ndarray | None, part: np.ndarray | None) -> str | None:
-    """Return a sentence about normals that are none of the camera frame, or None.
+    """Return a sentence about normals that are none of the camera frame, or a height that is in another unit than theirs, or None.
 
     Args:
         mask: [rows, cols] bool.

@@ -19,7 +19,7 @@ from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.light_factors import untold
 from service.light_estimation.brightness_step import find_step
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import LEAST_APART, fit_lambertian
+from service.light_estimation.lambertian import LEAST_APART, Fit, fit_lambertian
 from service.light_estimation.semi_calibrated import ROUND, fit_grey_intensities, told_by_relief
 from service.solve.base.solution import SolveInput
 from stage.capture.point_lights import DistantLights
@@ -78,20 +78,23 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     pixels = inside[evenly(len(inside), PIXELS)]
     radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance, lights.irradiance)
-    step = find_step(readings, usable, lights.direction, fit_lambertian(readings, usable, lights.direction))
+    declared = fit_lambertian(readings, usable, lights.direction)
+    step = find_step(readings, usable, lights.direction, declared)
     if step is None:
-        return _chosen(given, lights, pixels, readings, usable)
+        return _chosen(given, lights, pixels, readings, usable, declared)
     factors = step.factors(len(readings))
-    stepped = lights._replace(irradiance=lights.irradiance * factors[:, None])
-    chosen = _chosen(given, stepped, pixels, readings / factors[:, None], usable)
+    stepped, readings = lights._replace(irradiance=lights.irradiance * factors[:, None]), readings / factors[:, None]
+    chosen = _chosen(given, stepped, pixels, readings, usable, fit_lambertian(readings, usable, lights.direction))
     found = chosen.facts["light_intensities"]
     return ChosenIntensities(chosen.lights, {"light_intensities": {
         **found, "used": "estimated", "factors": (factors * np.array(found.get("factors", 1.0))).round(4).tolist(),
         "step": {"first": given.stack.frames[step.first], "factor": round(step.factor, 4)}}})
 
 
-def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readings: np.ndarray, usable: np.ndarray) -> ChosenIntensities:
-    """Return the lights with the intensities that readings [lights, pixels] of some pixels ask for, or as they are."""
+def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readings: np.ndarray, usable: np.ndarray,
+            declared: Fit) -> ChosenIntensities:
+    """Return the lights with the intensities that readings [lights, pixels] of some pixels ask for, or as they are. `declared`: the fit of
+    these readings."""
     place = np.stack(np.divmod(pixels, given.mask.shape[1])).astype(np.float64)
     place -= place.min(axis=1, keepdims=True)
     row, col = np.floor(place * SQUARES / (place.max() + 1)).astype(int)
@@ -100,7 +103,6 @@ def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readin
     # of no change, of all that half the pixels ask for, and of what they can tell
     cost = np.zeros((3, len(pixels)))
     gain = 0.0
-    declared = fit_lambertian(readings, usable, lights.direction)
     apart = declared.apart
     judged_apart = apart.sum() >= LEAST_APART
     try:
