@@ -153,6 +153,17 @@ class Camera(Strict):
             x, down = self.distortion.apply(x, down)
         return cu + self.focal_px[0] * x, cv + self.focal_px[1] * down
 
+    def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the pixels in which the camera sees points, whatever hides them: their rows and columns, 0 of those outside, and which lie
+        inside the image, each [n].
+        `points`: [n, 3] as of `image_coordinates`; none behind a perspective camera lies inside."""
+        front = points[:, 2] < 0 if self.projection == "perspective" else np.ones(len(points), dtype=bool)
+        u, v = self.image_coordinates(np.where(front[:, None], points, [0.0, 0.0, -1.0]))
+        col, row = (np.clip(np.floor(np.nan_to_num(at)), -1, side).astype(np.int64)
+                    for at, side in ((u, self.width), (v, self.height)))
+        inside = front & (col >= 0) & (row >= 0) & (col < self.width) & (row < self.height)
+        return np.where(inside, row, 0), np.where(inside, col, 0), inside
+
     def points(self, height: np.ndarray, first_row: int = 0) -> np.ndarray:
         """Return the camera-frame points of a height map.
         `height`: [rows, cols] camera-frame z, negative in front of a perspective camera, of the whole image or of some of its rows. Returns

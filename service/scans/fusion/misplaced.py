@@ -103,12 +103,8 @@ def _seen_through(scan: PreparedScan, points: np.ndarray, reach: float) -> np.nd
     """Return [n] bool, the points (metres, world) that lie before all that a scan measured around their line of sight, by `reach`."""
     image = scan.image
     there = points @ image.camera_from_world[:3, :3].T + image.camera_from_world[:3, 3]
-    front = there[:, 2] < 0
-    u, v = scan.camera.image_coordinates(np.where(front[:, None], there, [0.0, 0.0, -1.0]))
-    rows, cols = image.clear.shape
-    col, row = (np.clip(np.floor(np.nan_to_num(at)), -1, side).astype(np.int64) for at, side in ((u, cols), (v, rows)))
-    inside = front & (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
-    return inside & (-there[:, 2] < np.asarray(image.clear)[np.where(inside, row, 0), np.where(inside, col, 0)] - reach)
+    row, col, inside = scan.camera.pixels_of(there)
+    return inside & (there[:, 2] < 0) & (-there[:, 2] < np.asarray(image.clear)[row, col] - reach)
 
 
 def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -> list[Placing]:

@@ -106,14 +106,9 @@ def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
 def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which points lie before the surface of a range image, on it, and at pixels with a depth; arguments as of `sight`."""
-    camera = image.camera
     placed = applied(pose, points)
-    front = placed[:, 2] < 0 if camera.projection == "perspective" else np.ones(len(placed), dtype=bool)
-    placed = np.where(front[:, None], placed, [0.0, 0.0, -1.0])
-    u, v = camera.image_coordinates(placed)
-    col, row = (np.clip(np.floor(np.nan_to_num(x)), -1, 2**30).astype(np.int64) for x in (u, v))
-    inside = front & (col >= 0) & (row >= 0) & (col < camera.width) & (row < camera.height)
-    at = np.where(inside, row, 0) // image.step, np.where(inside, col, 0) // image.step
+    row, col, inside = image.camera.pixels_of(placed)
+    at = row // image.step, col // image.step
     near, far = image.nearest[at], image.farthest[at]
     judged = inside & (near != 0)
     depth = -placed[:, 2]

@@ -229,8 +229,12 @@ def test_distortion_is_opencvs():
     Camera(projection="orthographic", resolution=(40, 30))])
 def test_points_are_seen_at_their_pixels(camera):
     u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
-    found = camera.image_coordinates(camera.points(np.linspace(-3, -2, 1200).reshape(30, 40)))
-    assert np.allclose(found, (u, v), rtol=0, atol=2e-5)  # float32 points
+    points = camera.points(np.linspace(-3, -2, 1200).reshape(30, 40))
+    assert np.allclose(camera.image_coordinates(points), (u, v), rtol=0, atol=2e-5)  # float32 points
+    row, col, inside = camera.pixels_of(points.reshape(-1, 3))
+    assert inside.all() and np.array_equal(row * 40 + col, np.arange(1200))
+    beyond = camera.pixels_of(points.reshape(-1, 3) * [100, 100, 1])[2].reshape(30, 40)
+    assert not beyond[[0, -1]].any() and (camera.projection == "orthographic" or not camera.pixels_of(-points.reshape(-1, 3))[2].any())
 
 
 def test_perspective_points_lie_on_their_rays_in_front_of_the_camera():
