@@ -100,7 +100,7 @@ def before_a_wall(depth_m: float, columns: int) -> tof.View:
     return target._replace(distance=np.where(np.arange(COLS) < columns, target.distance, behind.distance))
 
 
-@pytest.mark.parametrize("pulsed", [False, True], ids=["cw", "pulsed"])
+@pytest.mark.parametrize("pulsed", [False, pytest.param(True, marks=pytest.mark.long)], ids=["cw", "pulsed"])
 def test_a_target_of_less_than_half_of_the_picture_is_said(pulsed, tmp_path):
     """The ranges of the wall were held against the distances of the target, and depth_m was blamed."""
     def written(columns, depths, declared):

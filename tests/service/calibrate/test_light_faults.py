@@ -74,6 +74,7 @@ def test_a_lamp_that_did_not_change_is_said(relit, tmp_path):
     assert "at one place" not in relit.done("calibrate", "mirror-ball", write(tmp_path / "near", images), "--ball", CIRCLE).out
 
 
+@pytest.mark.long
 def test_radii_that_are_exchanged_are_said_and_held_by_sigma(relit, tmp_path):
     """Two balls stand before a perspective camera. Positions were off by up to 21 times what was stated."""
     camera = {"focal": 400.0, "width": 200, "height": 80}

@@ -117,7 +117,7 @@ def test_a_datum_carries_the_scan(tmp_path, part):
     assert any("the datum regions leave 3 of 6 motions" in said for said in result.warnings)  # not the surface, as that of a cylinder
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.003])
+@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.long), 1.003])
 def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
     """A dent of .15 mm does not make the scan smaller, and does not hide that it is larger: the factor is known to .0001."""
     made, design = part

@@ -227,7 +227,7 @@ def test_a_faint_reflection_takes_nothing_out(relit, tmp_path):
     assert np.quantile(np.abs(maps.depth - scene.depth)[maps.mask], 0.99) < 1e-3
 
 
-@pytest.mark.parametrize("levels", [255, 100])
+@pytest.mark.parametrize("levels", [255, pytest.param(100, marks=pytest.mark.long)])
 def test_steps_of_a_file_are_no_light_of_the_laser(relit, tmp_path, levels):
     """A camera quieter than a step of its files, and planes that pass beside the picture: single readings a step off are no stripes."""
     write_lasers(tmp_path, SCENE, [plane(x) for x in np.linspace(-0.3, 0.3, 13)], width=1.5e-3, noise=0.001, levels=levels, camera=CAMERA)

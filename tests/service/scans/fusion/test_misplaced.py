@@ -100,7 +100,7 @@ def test_scans_of_another_scale_than_their_poses_are_named_so(tmp_path):
         fuse_scans(write_scans(tmp_path, shots), tmp_path / "out")
 
 
-@pytest.mark.parametrize(("count", "left_out"), [(12, True), (9, False)])
+@pytest.mark.parametrize(("count", "left_out"), [(12, True), pytest.param(9, False, marks=pytest.mark.long)])
 def test_a_scan_that_is_turned_by_90_degrees_is_told_by_what_others_saw_through(tmp_path, count, left_out):
     """Its surface lies near that of others only where it agrees with them by chance: it was fused with them, without a word. Where one
     other alone saw through it, nothing tells which of the two is wrong."""
@@ -122,7 +122,7 @@ def arc(folder, poses=None):
     return write_scans(folder, shots, poses=[poses(first @ shot.world_from_camera) for shot in shots])
 
 
-@pytest.mark.parametrize("moved_m", [0.0, 1.0])
+@pytest.mark.parametrize("moved_m", [pytest.param(0.0, marks=pytest.mark.long), 1.0])
 def test_inverted_poses_are_named_so(tmp_path, moved_m):
     """About a round body most of the surface fits all the same; with the world beside it nothing does."""
     file = arc(tmp_path, lambda pose: np.linalg.inv(pose + moved_m * np.outer(np.eye(4)[0], np.eye(4)[3])))

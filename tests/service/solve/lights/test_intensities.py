@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 from tests.reference import microfacet as twin
 from tests.scenes import captures
 
@@ -166,7 +167,7 @@ def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path
 
 
 @pytest.mark.parametrize(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
-@pytest.mark.parametrize("degrees", [1, 3, 5])
+@first_short("degrees", [3, 1, 5])
 def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_them(tmp_path, degrees, gloss, wrong):
     """As of a varnished picture: its normals were 22 to 29° off, by up to 61 σ, under right lights."""
     count, side = 12, 48
@@ -181,6 +182,7 @@ def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_t
     assert np.percentile(over_sigma, 99) < 5 and (gloss or np.median(error) < 0.3), np.median(error)
 
 
+@pytest.mark.long
 def test_an_exposure_that_changed_is_undone(tmp_path):
     """Half of the images of a rough cap, which asks for other lights too, are of half the exposure: normals are as without."""
     factor = np.where(np.arange(LIGHTS) < LIGHTS // 2, 1.0, 0.5)
