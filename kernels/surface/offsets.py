@@ -22,6 +22,7 @@ A ray that passes through the visible front of a part is hidden. One that lies b
 Nothing tells how thick a part is; the guess is that its back is its front mirrored in its outline.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -261,33 +262,33 @@ def weigh_offsets(
     told = (highest > NO_GAP) & (hidden == 0) & (odds != 0)
     gaps = [highest[told], to_numpy(shadows.lowest)[told], to_numpy(shadows.back)[told]]
     mine = np.broadcast_to(on_part[:, None], told.shape)[told]
-    whose = np.broadcast_to(group[None], told.shape)[told]
     # a part that nears comes before others' pixels: free, hidden, then these lie behind its front, then behind its back; its own pixels
     # go the other way round
     flat = gaps[1] - gaps[2] < FLAT * blur  # as a plate: the readings choose whether light passes behind it
     places = [_bin(np.where(mine, gap, -gap), reach) for gap in gaps]
     low, high = to_numpy(shadows.opening)[told].T
     opens, closes = (_bin(np.where(mine, own, -other), reach) for own, other in ((low, high), (high, low)))
+    bins = 2 * STEPS + 2
+    first, changes = np.broadcast_to(group[None] * bins, told.shape)[told], [np.zeros_like(opens), *places, opens, closes]
 
     def along(levels: list[np.ndarray]) -> np.ndarray:
-        change = np.zeros((GROUPS, 2 * STEPS + 2))
-        np.add.at(change, (whose, np.zeros_like(whose)), np.where(mine, levels[-1], levels[0]))
-        for place, before, after in zip(places, levels[:-1], levels[1:], strict=True):
-            np.add.at(change, (whose, place), np.where(mine, before - after, after - before))
-        for place, sign in ((opens, 1), (closes, -1)):
-            np.add.at(change, (whose, place), sign * (levels[-1] - levels[1]))
-        return _blurred(np.cumsum(change, axis=1)[:, :-1], blur / reach * STEPS)
+        apart = levels[-1] - levels[1]
+        steps = [np.where(mine, levels[-1], levels[0]), *(np.where(mine, before - after, after - before) for before, after in
+                                                          pairwise(levels)), apart, -apart]
+        change = np.sum([np.bincount(first + place, step, GROUPS * bins) for place, step in zip(changes, steps, strict=True)], axis=0)
+        return _blurred(np.cumsum(change.reshape(GROUPS, bins), axis=1)[:, :-1], blur / reach * STEPS)
 
     tried = [(0.0, 1.0, INSIDE, np.where(flat, behind, BEHIND)) for behind in (BEHIND, BEHIND_PLATE)]
-    states, gain = max(((states, along([np.log(1 + state * np.expm1(odds[told])) for state in states])) for states in tried),
+    swing, size = np.expm1(odds[told]), np.abs(odds[told])
+    states, gain = max(((states, along([np.log1p(state * swing) for state in states])) for states in tried),
                        key=lambda one: float(one[1].sum(axis=0).max()))
     best = int(np.argmax(gain.sum(axis=0)))
     passed = np.sum([place <= best for place in places], axis=0)
-    sure = 1 / (1 + np.exp(-np.abs(odds[told])))  # probability that a reading's odds have the sign of its state
+    sure = 1 / (1 + np.exp(-size))  # probability that a reading's odds have the sign of its state
     state = np.where((opens <= best) & (best < closes), 3, np.where(mine, 3 - passed, passed))
     dark = 1 - sure + np.choose(state, states) * (2 * sure - 1)
-    mean = along([dark * np.log(1 + state * np.expm1(np.abs(odds[told]))) + (1 - dark) * np.log(1 + state * np.expm1(-np.abs(odds[told])))
-                  for state in states])
+    up, down = np.expm1(size), np.expm1(-size)
+    mean = along([dark * np.log1p(state * up) + (1 - dark) * np.log1p(state * down) for state in states])
     return Evidence(np.linspace(-reach, reach, 2 * STEPS + 1), gain - gain[:, STEPS, None], mean[:, best, None] - mean)
 
 

@@ -286,23 +286,24 @@ def fit_near(readings: np.ndarray, usable: np.ndarray, lamps: Lamps, points: np.
     What the fit leaves is relative to the bright readings of the pixel, which do not depend on where the point is thought to be, so that
     places can be compared by it.
     """
-    way = lamps.place[:, None, :3] - lamps.place[:, None, 3:] * points  # [lights, pixels, 3]
+    way = lamps.place[:, :3] - lamps.place[:, 3:] * points[:, None]  # [pixels, lights, 3]
     distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
     direction = way / distance[..., None]
-    shining = np.maximum(-np.einsum("lc,lpc->lp", lamps.lobe[:, :3], direction), 0) ** lamps.lobe[:, 3:]
-    irradiance = lamps.strength[:, None] * shining / np.where(lamps.place[:, 3:] == 1, distance**2, 1.0)
+    irradiance = lamps.strength / np.where(lamps.place[:, 3] == 1, distance**2, 1.0)
+    if lamps.lobe.any():
+        irradiance *= np.maximum(-(direction * lamps.lobe[:, :3]).sum(axis=2), 0) ** lamps.lobe[:, 3]
     # one factor a pixel: only the ratios of the lights count
-    lit_by = direction * (irradiance / np.maximum(irradiance.mean(axis=0), 1e-300))[..., None]
+    lit_by = direction * (irradiance / np.maximum(irradiance.mean(axis=1, keepdims=True), 1e-300))[..., None]
     bright = np.maximum(bright_readings(readings, usable), 1e-300)
     relative = readings / bright
     lit = usable & (relative > SHADOW)
     weight = lit.astype(np.float64)
     for _ in range(FIT_ROUNDS):
-        weighted = lit_by * weight[..., None]
-        gram = np.einsum("lpa,lpb->pab", weighted, lit_by)
+        weighted = (lit_by * weight.T[..., None]).transpose(0, 2, 1)
+        gram = weighted @ lit_by
         gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
-        vector = np.linalg.solve(gram, np.einsum("lpa,lp->pa", weighted, relative)[:, :, None])[:, :, 0]
-        residual = np.where(lit, np.clip(relative - np.einsum("lpa,pa->lp", lit_by, vector), -LARGEST_RESIDUAL, LARGEST_RESIDUAL), 0)
+        vector = np.linalg.solve(gram, weighted @ relative.T[..., None])
+        residual = np.where(lit, np.clip(relative - (lit_by @ vector)[..., 0].T, -LARGEST_RESIDUAL, LARGEST_RESIDUAL), 0)
         spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
-    return NearFit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)).T, residual, lit)
+    return NearFit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300))[..., 0].T, residual, lit)

@@ -44,12 +44,17 @@ def tear(surface: Integration, height: np.ndarray, scene_of: Callable[[], PartSc
     scene.show(height, fragment)
     moved_by: dict[int, Offset] = {}
     main = int(np.argmax(np.bincount(part_of, weights=size)))
+    settled: set[int] = set()  # judged since anything moved last: they would be placed as they were
     for number in SWEEPS * judged[:MOST_PARTS]:
+        if number in settled:
+            continue
         others = np.flatnonzero((part_of == main) | (part_of == part_of[number]))
         step = scene.step_of(number, against=[int(other) for other in others if other != number])
         before = moved_by.pop(number).offset if number in moved_by else 0.0
         known = scene.is_known(step.low, step.high)
-        scene.move(number, step.offset if known else -before)
+        offset = step.offset if known else -before
+        scene.move(number, offset)
+        settled = set() if offset else {*settled, number}
         if known:
             moved_by[number] = step._replace(offset=before + step.offset)
     apart = {number: step for number, step in moved_by.items() if abs(step.offset) > APART_SIGMAS * step.sigma}

@@ -194,15 +194,14 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
     for number in range(ROUNDS):
         sides = _tangents(fit.normal)
         by, by_turn = _slopes(sample, fit, seen, left, sides)
-        weight = sample.weights(left)
-        own = np.einsum("lpi,lp,lpj->pij", by, weight, by)
+        weight = sample.weights(left).T[..., None]
+        weighed = (by * weight).transpose(0, 2, 1)
+        own = weighed @ by
         own += np.einsum("p,pii,ij->pij", damped, own, np.eye(5)) + np.diag(HELD + 1e-9)
-        shared = np.einsum("lpi,lp,lpj->pij", by, weight, by_turn)
-        asked = np.einsum("lpi,lp->pi", by, weight * left)
-        solved = np.linalg.solve(own, np.concatenate([shared, asked[..., None]], axis=2))
-        alone = by_turn - np.einsum("lpi,pij->lpj", by, solved[..., :2])  # of the turn, where the pixel makes the best of it
-        inverse = np.linalg.pinv(np.einsum("lpi,lp,lpj->ij", by_turn, weight, alone))
-        scores = alone * (weight * left)[..., None]
+        solved = np.linalg.solve(own, np.concatenate([weighed @ by_turn, weighed @ left.T[..., None]], axis=2))
+        alone = by_turn - by @ solved[..., :2]  # of the turn, where the pixel makes the best of it
+        inverse = np.linalg.pinv((by_turn * weight).reshape(-1, 2).T @ alone.reshape(-1, 2))
+        scores = alone * (weight * left.T[..., None])
         turn = inverse @ scores.sum(axis=(0, 1)) if turning and number >= ALONE else np.zeros(2)
         steps = np.clip(solved[..., 2] - solved[..., :2] @ turn, -LARGEST_STEP, LARGEST_STEP)
         still, moved = fit.moved(sides, np.zeros_like(steps), turn), fit.moved(sides, steps, turn)
@@ -212,16 +211,16 @@ def _fitted(sample: _Sample, fit: _Fit, *, turning: bool, place: tuple[np.ndarra
         damped = np.clip(np.where(better, damped / 3, damped * 5), 1e-6, 1e6)
         fit = _Fit(np.where(better[:, None], moved.normal, still.normal), np.where(better, moved.logs, still.logs), moved.turn)
         left = np.where(better, left_moved, left_still)
-    of_lights = scores.sum(axis=1)
-    return fit, between_blocks(inverse, scores.sum(axis=0), *place) + inverse @ (of_lights.T @ of_lights) @ inverse
+    of_lights = scores.sum(axis=0)
+    return fit, between_blocks(inverse, scores.sum(axis=1), *place) + inverse @ (of_lights.T @ of_lights) @ inverse
 
 
 def _slopes(sample: _Sample, fit: _Fit, seen: _Seen, left: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the model by the parameters of each pixel, [lights, pixels, 5], and by the turn, [lights, pixels, 2]."""
+    """Return the derivatives of the model by the parameters of each pixel, [pixels, lights, 5], and by the turn, [pixels, lights, 2]."""
     steps = [STEP * np.broadcast_to(unit, (len(fit.normal), 5)) for unit in np.eye(5)]
     own = [fit.moved(sides, step, np.zeros(2)).left(sample, seen) for step in steps]
     turned = [fit.moved(sides, np.zeros_like(steps[0]), STEP * unit).left(sample) for unit in np.eye(2)]
-    return np.stack([(left - other) / STEP for other in own], axis=-1), np.stack([(left - other) / STEP for other in turned], axis=-1)
+    return np.stack([(left - other).T / STEP for other in own], axis=-1), np.stack([(left - other).T / STEP for other in turned], axis=-1)
 
 
 def _reflect(normal: np.ndarray, view: np.ndarray, seen: _Seen, values: np.ndarray) -> np.ndarray:
