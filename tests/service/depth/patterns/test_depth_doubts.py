@@ -140,7 +140,7 @@ def test_most_pixels_refused_is_said(relit, tmp_path, light):
     write_capture(tmp_path, ROOM, patterns, light=light, focal_px=[2 * RIG.projector_focal] * 2)
     maps, report, _ = solve(relit, tmp_path)
     assert any("lit pixels have a depth that can be trusted; most of the" in sentence for sentence in report["warnings"])
-    assert maps.confidence[maps.mask].max() < 0.2
+    assert not maps.mask.any() and maps.confidence.max() < 0.2  # those whose lines of sight meet do so by chance
 
 
 def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):

@@ -112,6 +112,17 @@ def test_a_wrong_pose_is_named_and_sigma_holds_it(relit, tmp_path, degrees):
     assert np.median(left) < 0.8 * np.median(error * maps.sigma[maps.mask]) and (left > 5 * refined.sigma[refined.mask]).mean() < 0.01
 
 
+@pytest.mark.parametrize("times", [2.0, pytest.param(0.5, marks=pytest.mark.long)])
+def test_lines_of_sight_that_meet_by_chance_give_no_depth(relit, tmp_path, times):
+    """A tenth of them met under another focal length, nearly all of these far off."""
+    two_captures(tmp_path, 0.004)
+    camera = json.loads((tmp_path / "second" / "capture.json").read_text())["camera"]
+    edit_manifest(tmp_path / "second", camera={**camera, "focal_px": [times * focal for focal in camera["focal_px"]]})
+    outcome = relit("depth", tmp_path / "first", "--beside", tmp_path / "second", "--out", tmp_path / "out", "--device", "cpu")
+    assert outcome.code == 1 and "check camera.world_from_camera of both captures" in outcome.out and "camera.focal_px" in outcome.out
+    assert not DepthMaps.read(tmp_path / "out" / "depth.exr").mask.any()
+
+
 def test_what_is_missing_is_named(relit, tmp_path):
     two_captures(tmp_path)
     command = ["depth", tmp_path / "first", "--beside", tmp_path / "second", "--out", tmp_path / "out"]
