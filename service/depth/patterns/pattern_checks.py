@@ -139,8 +139,8 @@ READINGS = (
     Reading("the steps 0 and 2 of the phases are exchanged: check step in the frames' patterns",
             _changed(step=lambda p: (2 - p.step) % p.steps)),
     Reading("the images are in reverse order: check image in frames", lambda patterns: patterns[::-1]),
-    Reading("the images are one frame late: check image in frames", lambda patterns: [*patterns[1:], patterns[0]]),
-    Reading("the images are one frame early: check image in frames", lambda patterns: [patterns[-1], *patterns[:-1]]),
+    Reading("each image shows the pattern of the next frame: check image in frames", lambda patterns: [*patterns[1:], patterns[0]]),
+    Reading("each image shows the pattern of the frame before: check image in frames", lambda patterns: [patterns[-1], *patterns[:-1]]),
     Reading("the images of white and black are at the other end of the sequence: check image in frames", _around),
     Reading("the projected image is mirrored: check the projector's settings and projector.camera_from_projector", list, True),
 )
@@ -211,7 +211,7 @@ def check_references(sample: Sample, collected: Collected, noise: NoiseModel) ->
     if len(brighter) < ENOUGH or brighter.mean() < MOST_BRIGHTER:
         return None
     return (f"frames: black is brighter than white at {100 * brighter.mean():.0f} % of the lit pixels: exchange the images of the frames "
-            "white and black")
+            "white and black, or, where all images are one frame off, give each its own pattern")
 
 
 def check_declaration(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
