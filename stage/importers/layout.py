@@ -177,7 +177,7 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         manifest = Manifest.model_validate({"schema": SCHEMA, **data})
     except ValidationError as error:
         raise ManifestError(f"{table}: {describe(error)}") from error
-    manifest = manifest.model_copy(update={"assumed": (*manifest.assumed, *_other_sizes(manifest))})
+    manifest = manifest.model_copy(update={"assumed": (*manifest.assumed, *other_sizes(manifest))})
     made = {name: _npy(array) for name, array in (arrays or {}).items()}
     for name, content in made.items():
         target = destination / name
@@ -197,8 +197,8 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
     return path
 
 
-def _other_sizes(manifest: Manifest) -> Iterator[str]:
-    """Give a sentence for each device whose calibration looks like one at another size of images: its principal point lies off the middle
+def other_sizes(manifest: Manifest) -> Iterator[str]:
+    """Yield a sentence for each device whose calibration looks like one at another size of images: its principal point lies off the middle
     by the same part of both sides, which that of a part of an image or of a shifted lens hardly ever does."""
     devices: list[tuple[str, Camera | Projector | OtherCamera]] = [("camera", manifest.camera)]
     devices += [("projector", manifest.projector)] if isinstance(manifest.projector, Projector) else []

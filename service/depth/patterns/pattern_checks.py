@@ -163,9 +163,7 @@ def agreement(sample: Sample, patterns: list[Pattern], projector: PatternProject
     shape = sample.mask.shape
     decoded = [None if decoder is None else decode_sample(sample, decoder, noise, device) for decoder in decoders]
     if mirrored:
-        decoded = [None if axis is None else axis._replace(
-            coordinate=type(axis.coordinate)(extent - to_numpy(axis.coordinate), device=device))
-            for axis, extent in zip(decoded, model.size, strict=True)]
+        decoded = turned_about(decoded, model, device)
     found = triangulate(sample.x.ravel(), sample.y.ravel(), decoded[0], decoded[1], model, near_m=0.0, far_m=np.inf, max_residual_px=4.0,
                         device=device)
     depth, sigma, status = (to_numpy(array)[:sample.mask.size].reshape(shape) for array in (found.depth, found.sigma, found.status))
@@ -180,6 +178,12 @@ def agreement(sample: Sample, patterns: list[Pattern], projector: PatternProject
     limit = np.maximum(SMOOTH_PART * far, np.minimum(SMOOTH_SIGMAS * deviation, 0.1 * far))
     expected = erf(limit / np.maximum(np.sqrt(2) * deviation, 1e-12))
     return Agreement(float((step <= limit).sum() / pairs.sum()), float(expected.mean()) if expected.size else 1.0)
+
+
+def turned_about(decoded: list[Decoded | None], model: ProjectorModel, device: str) -> list[Decoded | None]:
+    """Return what is decoded as if it ran from the other borders of the projector."""
+    return [None if axis is None else axis._replace(coordinate=type(axis.coordinate)(extent - to_numpy(axis.coordinate), device=device))
+            for axis, extent in zip(decoded, model.size, strict=True)]
 
 
 def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, device: str) -> Decoded:

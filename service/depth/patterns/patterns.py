@@ -25,6 +25,7 @@ from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_no
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
 from service.depth.patterns.pattern_checks import Sample, check_declaration, check_references, check_unevenness, sample_of
+from service.depth.patterns.pose_checks import check_pose
 from service.depth.patterns.readings import DECODE_BYTES_PER_PIXEL, Readings, full_scale, scene_colour
 from service.depth.patterns.response_checks import check_ramps, find_exponent, response_sentence
 from service.depth.patterns.shifted_frames import widen_shifted
@@ -104,7 +105,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                                unseen_digits=unseen_digits(sample, codes.collected, shown, noise))
         codes = read_codes(capture, frames, shown, refine=request.refine)
         measured = with_measured_noise(planes, capture.camera, mask, codes.collected, noise)
-        warnings, codes, declared = _checked(sample, codes, shown, projector, capture, frames, noise, measured[0], device, request)
+        warnings, codes, declared = checked(sample, codes, shown, projector, capture, frames, noise, measured[0], device,
+                                            refine=request.refine)
         noisier = 1.0
         if declared:  # else what contradicts the declaration would count as noise
             noise, noisier = measured
@@ -182,9 +184,10 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
     return PatternProjector((size["column"] or 1, size["row"] or 1))  # an axis without a code has no coordinate
 
 
-def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projector: Projector | None, capture: Capture,
-             frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, request: DepthRequest) -> Checks:
-    """Judge the declaration by a sample of the frames. `measured`: the noise that the frames show, by which levels and ramps are judged."""
+def checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projector: Projector | None, capture: Capture,
+            frames: list[Frame], noise: NoiseModel, measured: NoiseModel, device: str, *, refine: bool) -> Checks:
+    """Judge the declaration by a sample of the frames. `projector`: None where it is not calibrated. `measured`: the noise that the frames
+    show, by which levels and ramps are judged."""
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = check_inverted(sample, codes.collected, noise) or check_references(sample, codes.collected, noise)
     wrong = wrong or check_order(sample, codes.collected, noise) or (
@@ -199,14 +202,16 @@ def _checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, proje
         return Checks([wrong], codes, False)
     bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or shown._replace(
         exponent=find_exponent(sample, codes.collected, shown, noise, device))
-    wrong = check_range(sample, codes.collected, bent, noise)
-    if wrong is not None:
-        return Checks([wrong], codes, False)
     said = [] if waves.unconfirmed is None else [waves.unconfirmed]
+    names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
+    if projector is not None and projector.principal_px is None and len(names) == 1:
+        said.append("projector.principal_px: is missing, and the middle of its image is taken, which patterns of one axis cannot confirm: "
+                    "give it (relit calibrate procam measures it)")
     if bent.exponent != shown.exponent:
-        names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-        return Checks([response_sentence(bent, names), *said], read_codes(capture, frames, bent, refine=request.refine), True)
-    return Checks(said, codes, True)
+        codes, said = read_codes(capture, frames, bent, refine=refine), [response_sentence(bent, names), *said]
+    wrong = check_range(sample, codes.collected, bent, noise) or (
+        None if projector is None else check_pose(sample, (codes.columns, codes.rows), projector_model(projector), noise, device))
+    return Checks(said, codes, True) if wrong is None else Checks([wrong], codes, False)
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:
