@@ -15,7 +15,8 @@ from service.calibrate.solvers.bundle import Certainty
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, first_alike, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
-from service.depth.patterns.patterns import decoded_bands, read_codes
+from service.depth.patterns.pattern_checks import sample_of
+from service.depth.patterns.patterns import checked, decoded_bands, read_codes
 from service.depth.patterns.readings import full_scale, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
@@ -98,7 +99,9 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
     """Return the corners of the board as camera and projector see them, or a sentence that says why there are none."""
     frames, series = frames_shown(capture)
-    codes = read_codes(capture, frames, PatternProjector(size))
+    given = capture.manifest.projector
+    shown = PatternProjector(size) if given is None else PatternProjector(size, given.response, given.crosstalk)
+    codes = read_codes(capture, frames, shown)
     columns, rows = codes.columns, codes.rows
     if columns is None or rows is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no {'column' if columns is None else 'row'} code: "
@@ -108,9 +111,6 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
     if scene is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame, no inverses and no phases: "
                             "the board must be seen evenly lit")
-    corners = find_board(scene @ np.array(GREY_WEIGHTS, np.float32), request.board, charuco_of(request))
-    if isinstance(corners, str):
-        return corners
     shape = (capture.camera.height, capture.camera.width)
     u, v, decoded = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
     options = DepthRequest.model_fields
@@ -118,7 +118,14 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(options["read_noise"].default * full * reads**0.5, options["photon_gain"].default * full)
-        for band, axes in decoded_bands(planes, (columns, rows), noise, device):
+        found = checked(sample_of(planes, capture.camera, np.ones(shape, bool)), codes, shown, None, capture, frames, noise, noise, device,
+                        refine=False)
+        if not found.declared:
+            return found.warnings[0]
+        corners = find_board(scene @ np.array(GREY_WEIGHTS, np.float32), request.board, charuco_of(request))
+        if isinstance(corners, str):
+            return corners
+        for band, axes in decoded_bands(planes, (found.codes.columns, found.codes.rows), noise, device):
             part = u[band].shape
             count = part[0] * part[1]
             first, second = (axis for axis in axes if axis is not None)

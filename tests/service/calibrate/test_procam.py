@@ -102,6 +102,18 @@ def test_copies_of_a_pose_count_once(relit, copies, tmp_path):
     assert [left["remark"] for left in reports[1]["left_out"]] == [f"left out: a copy of {folder}" for folder in copies[:3]]
 
 
+def test_views_whose_frames_contradict_their_patterns_are_left_out(relit, copies):
+    """Black and white are exchanged in one view, whose light is uneven: readings that are all at full scale say nothing."""
+    pose = list(boards.poses(5))[1]
+    write_view(copies[1], pose, boards.board_image(pose) * np.linspace(0.6, 1, CAMERA.width))
+    frames = json.loads((copies[1] / "capture.json").read_text())["frames"]
+    black, white = (frame["image"] for frame in frames[-2:])
+    edit_manifest(copies[1], frames=[*frames[:-2], {**frames[-2], "image": white}, {**frames[-1], "image": black}])
+    _, report = calibrated(relit, copies, *WORDS)
+    (left,) = report["left_out"]
+    assert left["view"] == str(copies[1]) and left["remark"].startswith("frames: black is brighter") and len(report["views"]) == 4
+
+
 def test_a_rig_is_calibrated_with_a_charuco_board_seen_in_part(relit, tmp_path):
     """Each pose has another strip of the board cut off by the image or hidden."""
     sheet = charuco.print_of("aruco4", boards.BOARD, side=0.75)
