@@ -36,9 +36,9 @@ UNLIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURAT
 """Statuses of pixels that the projector does not light well enough to tell anything."""
 SURE_SHARE = 0.5
 """Share of the lit pixels with a depth that can be trusted, below which the whole capture is doubted."""
-BY_CHANCE = 0.5
-"""Pixels whose lines of sight meet no light of theirs over the sure ones of a doubted capture, from which on these meet by chance: cameras
-of twice the focal length left 4 to 26 % of the pixels sure, 96 % of them off by more than five deviations."""
+BY_CHANCE, LEAST_APART = 0.5, 0.1
+"""Pixels whose lines of sight meet no light of theirs, over the sure ones of a doubted capture and over the lit ones, from which on the
+sure ones meet by chance: cameras of twice the focal length left 4 to 26 % sure, 96 % of them off by more than five deviations."""
 ADVICE = {
     Status.MULTIPATH: "light comes by several ways, as in fog or off shiny and translucent surfaces: project a code whose stripes are all "
                       "fine (micro, modulated, xor)",
@@ -129,12 +129,13 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
         right = np.minimum(right, DOUBTED)
     elif lit.sum() >= ENOUGH and share < SURE_SHARE:
         refused = np.where(lit & ~sure & np.isin(solution.status, SOLVED), int(Status.UNSURE), solution.status)[lit & ~sure]
-        most = Status(int(np.bincount(refused).argmax()))
-        if (refused == Status.OUT_OF_RANGE).sum() > BY_CHANCE * sure.sum():
+        most, part = Status(int(np.bincount(refused).argmax())), "most"
+        if (refused == Status.OUT_OF_RANGE).sum() > max(BY_CHANCE * sure.sum(), LEAST_APART * lit.sum()):
+            part = "most" if most == Status.OUT_OF_RANGE else "many"
             most, right = Status.OUT_OF_RANGE, np.minimum(right, DOUBTED)
         what = "depth" if isinstance(solution, DepthSolution) else "place in the projector"
         warnings = [*warnings, f"frames: {100 * share:.2g} % of the {int(lit.sum())} lit pixels have a {what} that can be trusted; "
-                               f"most of the others are {most.name.lower().replace('_', ' ')}: {advice[most]}"]
+                               f"{part} of the others are {most.name.lower().replace('_', ' ')}: {advice[most]}"]
     confidence = solution.confidence_map()
     assert confidence is not None  # it follows from sigma
     solution.confidence = (right * min(1.0, share / SURE_SHARE) * confidence).astype(np.float32)

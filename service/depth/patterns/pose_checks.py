@@ -16,6 +16,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.patterns.decoders import AxisDecoder
 from service.depth.patterns.pattern_checks import ENOUGH, Sample, decode_sample, turned_about
+from stage.transforms import OPENCV_FROM_CAMERA
 
 OUTSIDE = 0.05
 """Share of the decoded pixels, beside others like them, without a point that the projector can light, from which on it is doubted: no
@@ -29,8 +30,6 @@ PLANE_PX, PLANE_SIGMAS = 0.15, 2.5
 """Distance from a plane within which a pixel lies in it, in projector pixels for what lenses leave, and in deviations that are added."""
 MOST_POINTS, TRIALS = 1500, 150
 """Number of pixels of which a plane is sought, and of planes through three of them: with a third of them in it, five in 150 are."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Turns the axes of a device, y down and z forward, into those of a manifest's poses, and back."""
 
 
 class Fit(NamedTuple):
@@ -50,8 +49,8 @@ def check_pose(sample: Sample, decoders: tuple[AxisDecoder | None, AxisDecoder |
     declared = _fit(sample, decoded, model, device)
     if declared is None:
         return None
-    turn, shift = FLIP @ model.projector_from_camera[:, :3], FLIP @ model.projector_from_camera[:, 3]
-    inverse = model._replace(projector_from_camera=FLIP @ np.column_stack([turn.T, -turn.T @ shift]))
+    own = OPENCV_FROM_CAMERA @ model.projector_from_camera  # on the axes of a manifest's poses
+    inverse = model._replace(projector_from_camera=OPENCV_FROM_CAMERA @ np.column_stack([own[:, :3].T, -own[:, :3].T @ own[:, 3]]))
     for words, view, shown in (
             ("it is the inverse: give the pose of the projector in the camera frame", inverse, decoded),
             ("the projected image is mirrored, or dark and bright are exchanged in all bits: check the projector's settings and the images",
