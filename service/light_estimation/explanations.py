@@ -26,6 +26,7 @@ from service.light_estimation.lambertian import (
 )
 from service.light_estimation.neighbours import IN_ORDER, MIN_LIGHTS_SMOOTH, SMOOTH, in_order
 from service.light_estimation.semi_calibrated import ROUND, TINY, fit_intensities, told_by_relief
+from service.light_estimation.steady_light import fit_steady_light
 from stage.colour.colour import GREY_WEIGHTS
 from stage.colour.colour_spaces import is_linear
 from stage.errors import CalibrationError
@@ -102,6 +103,7 @@ class Explanation(NamedTuple):
     """The change of brightness, where it is the cause."""
     part: float = 0.0
     """Median of the light that all images share, over that of a lamp which a pixel faces."""
+    normal: np.ndarray | None = None  # [3, pixels] of the sample without that light
 
 
 class Sample(NamedTuple):
@@ -127,10 +129,12 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
     count, misfit = len(sample.directions), given.misfit()
     if count < MIN_LIGHTS or given.spare.sum() < MIN_PIXELS or given.spare.mean() < MIN_PART:
         return None
+    encoding, (steady, shown, everywhere) = _encoding(sample, given, misfit), _steady_light(sample, given)
+    if shown and (encoding is None or steady.left < encoding.left):
+        return steady
     step = _step(sample, given, misfit)
     if step is not None:
         return step
-    encoding = _encoding(sample, given, misfit)
     order = _order(sample, given, misfit)
     plain = min((found for found in (encoding, order) if found is not None), key=lambda found: found.left, default=None)
     brightness = _brightness(sample, given, misfit) if count >= MIN_LIGHTS_SCALED else None
@@ -144,7 +148,7 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
     free = _free_directions(sample, given) if count >= MIN_LIGHTS_FREE else None
     if free is None:
         return None
-    if (steady := _steady_light(sample, given, free)) is not None:
+    if everywhere and _explains(steady.left, steady.misfit, TIMES_FREE) and steady.left <= ABOUT * free.left:
         return steady
     of_a_coin = given.apart.mean() < ROUND and in_order(grey_readings(sample.radiance, sample.irradiance), sample.directions, IN_ORDER)
     return None if of_a_coin else free
@@ -299,19 +303,17 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
 
 
-def _steady_light(sample: Sample, given: Fit, free: Explanation) -> Explanation | None:
-    """Return the light that all images share, if the declared directions and it explain them as free directions do."""
+def _steady_light(sample: Sample, given: Fit) -> tuple[Explanation, bool, bool]:
+    """Return the light that all images share, as far as they do, whether readings in shadow show it, and whether it may be everywhere."""
     shared = grey_readings(np.ones((len(sample.directions), 1, 3)), sample.irradiance)  # the same radiance in all images, as readings
     shared /= shared.mean()
-    fit = fit_lambertian(grey_readings(sample.radiance, sample.irradiance), sample.usable, np.hstack([sample.directions, shared]))
-    chosen = fit.lit.sum(axis=0) >= MIN_READINGS_FREE
-    misfit, left = given.misfit(chosen), fit.misfit(chosen)
-    length = np.maximum(np.linalg.norm(fit.vector[:3], axis=0), TINY)
-    part = (fit.vector[3] / length)[chosen]
-    if not _explains(left, misfit, TIMES_FREE) or left > ABOUT * free.left or (part > 0).mean() < STEADY_EVERYWHERE:
-        return None
-    turned = degrees_between(given.normal, fit.vector[:3] / length)[chosen]
-    return Explanation(Cause.STEADY, misfit, left, float(np.median(turned)), part=float(np.median(part)))
+    found = fit_steady_light(grey_readings(sample.radiance, sample.irradiance), sample.usable, sample.directions, shared)
+    spare = found.fit.spare | ~found.fit.spare.any()
+    part, turned = found.part[spare], degrees_between(given.normal, found.fit.normal)[spare]
+    told = Explanation(Cause.STEADY, given.misfit(), found.fit.misfit(), float(np.median(turned)), part=float(np.median(part)),
+                       normal=found.fit.normal)
+    shown = bool(found.in_shadow) and told.left < told.misfit
+    return told, shown, found.in_shadow is not False and bool((part > 0).mean() >= STEADY_EVERYWHERE)
 
 
 def explanation_sentence(found: Explanation, sample: Sample) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
+from kernels.status import ESTIMATED
 from service.light_estimation.declared_lights import sample_of
 from service.light_estimation.explanations import (
     PIXELS,
@@ -111,7 +112,9 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
         if found is not None:
             repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.STEP, Cause.NORMALISED)
             solution.warnings.append(explanation_sentence(found, sample) + (REPAIRED if repaired else ""))
-            if not repaired:
+            if found.normal is not None:
+                _raise_to(given, solution, found.normal)
+            elif not repaired:
                 raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
@@ -153,16 +156,30 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
 
 def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None:
     """Make normals less sure by what they would be if the images were adapted in brightness from place to place."""
-    inside = np.flatnonzero(given.mask)
-    chosen = inside[evenly(len(inside), PIXELS)]
-    adapted = find_adapted(sample, np.stack(np.divmod(chosen, given.mask.shape[1]), axis=1))
+    adapted = find_adapted(sample, np.stack(np.divmod(_sampled(given), given.mask.shape[1]), axis=1))
     if adapted is None:
         return
-    turned = degrees_between(solution.normal[:, chosen], adapted.fit.normal)
+    turned = _raise_to(given, solution, adapted.fit.normal)
     solution.warnings.append("images: they may be adapted in brightness from place to place, as by HDR or local contrast of a phone, in "
-                             f"place of lights of other strengths, which turns normals by {np.median(turned):.2g}°: give images without; "
+                             f"place of lights of other strengths, which turns normals by {turned:.2g}°: give images without; "
                              "sigma holds that")
-    raise_error(solution, at_all_pixels(given.mask, chosen, turned))
+
+
+def _sampled(given: SolveInput) -> np.ndarray:
+    """Return the positions of the pixels of `sample_of`."""
+    inside = np.flatnonzero(given.mask)
+    return np.asarray(inside[evenly(len(inside), PIXELS)])
+
+
+def _raise_to(given: SolveInput, solution: Solution, normal: np.ndarray) -> float:
+    """Add to σ how far normals are from what they may be, [3, pixels] at those of the sample, and return the median of these angles."""
+    chosen = _sampled(given)
+    told = np.isin(solution.status[chosen], ESTIMATED)
+    if not told.any():
+        return 0.0
+    turned = degrees_between(solution.normal[:, chosen], normal)[told]
+    raise_error(solution, at_all_pixels(given.mask, chosen[told], turned))
+    return float(np.median(turned))
 
 
 def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:

@@ -21,6 +21,7 @@ from service.light_estimation.brightness_step import find_step
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import LEAST_APART, Fit, fit_lambertian
 from service.light_estimation.semi_calibrated import ROUND, fit_grey_intensities, told_by_relief
+from service.light_estimation.steady_light import fit_steady_light
 from service.solve.base.solution import SolveInput
 from stage.capture.point_lights import DistantLights
 from stage.errors import CalibrationError
@@ -79,6 +80,9 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance, lights.irradiance)
     declared = fit_lambertian(readings, usable, lights.direction)
+    shared = grey_readings(np.ones((len(readings), 1, 3)), lights.irradiance)
+    if fit_steady_light(readings, usable, lights.direction, shared / shared.mean()).in_shadow:
+        return _declared(lights, "the images share light that is not that of their lamps")
     step = find_step(readings, usable, lights.direction, declared)
     if step is None:
         return _chosen(given, lights, pixels, readings, usable, declared)

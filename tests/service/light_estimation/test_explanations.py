@@ -81,13 +81,40 @@ def test_lights_that_differ_are_no_step(change):
     assert found is None or found.cause is not Cause.STEP
 
 
-def ball(gloss):
-    """Readings of a ball of an albedo that varies, under 24 lights in an order that follows no direction."""
+@pytest.mark.parametrize(("count", "room", "window"), [(8, 0.3, 0.5), (8, 0.15, 0.0), (24, 0.3, 0.8)])
+def test_light_of_the_room_is_told_by_what_lamps_do_not_reach(count, room, window):
+    """A glossy ball under 8 to 24 lights, in a room that gives a part of a lamp's light, from above more than from below. Rough sheen,
+    which takes up a constant as well, is dark under lamps behind it, and light that bounces differs from lamp to lamp."""
+    readings, lights = ball(0.05, count)
     draw = np.random.default_rng(6)
-    lights = fibonacci_sphere(80)
-    lights = draw.permutation(lights[lights[:, 2] > 0.4][:24])
+    normal, albedo = _surface(draw)
+    around = albedo / np.pi * (0.5 + 0.5 * window * normal[:, 1])
+    sample = sample_of(readings + room * around, lights)
+    found = better_explanation(sample, fit_manifest(sample))
+    assert found.cause is Cause.STEADY and "add an image with all lamps off" in explanation_sentence(found, sample)
+    turned = np.degrees(np.arccos(np.clip((found.normal * normal.T).sum(axis=0), -1, 1)))
+    assert np.median(turned) < 1.5  # noise of one per cent and the highlight
+    bounced = 0.2 * albedo * readings.mean(axis=1, keepdims=True) * np.maximum(lights @ unit(np.array([1.0, 0.0, 0.3])), 0)[:, None]
+    sheen = 0.1 * albedo * np.maximum(lights @ normal.T, 0) ** 0.3
+    for other in (readings, readings + bounced, readings + sheen):
+        sample = sample_of(other, lights)
+        found = better_explanation(sample, fit_manifest(sample))
+        assert found is None or found.cause is not Cause.STEADY
+
+
+def _surface(draw):
+    """Normals [600, 3] of a ball seen from the front, and their albedo."""
     normal = unit(draw.normal(size=(2400, 3)) * [1, 1, 0] * draw.uniform(0, 1, (2400, 1)) + [0, 0, 0.7])[:600]
-    matt = draw.uniform(0.2, 0.7, 600) / np.pi * np.maximum(lights @ normal.T, 0)
+    return normal, draw.uniform(0.2, 0.7, 600)
+
+
+def ball(gloss, count=24):
+    """Readings of a ball of an albedo that varies, under lights in an order that follows no direction."""
+    draw = np.random.default_rng(6)
+    normal, albedo = _surface(draw)
+    lights = fibonacci_sphere(80)
+    lights = draw.permutation(lights[lights[:, 2] > 0.4][:24])[:count]
+    matt = albedo / np.pi * np.maximum(lights @ normal.T, 0)
     readings = matt + gloss * np.stack([specular(normal, light, VIEW, 0.3, 0.2) for light in lights])
     return readings * (1 + 0.01 * draw.normal(size=readings.shape)), lights
 

@@ -117,6 +117,16 @@ def test_wrong_brightness_that_the_solve_replaces_is_named_and_not_doubted(tmp_p
     assert np.median(angles_degrees(result.maps.normal[mask], SCENE.normal[mask])) < 3  # the noise of the images and a highlight
 
 
+def test_light_of_the_room_is_named_and_held(tmp_path):
+    """Three tenths of a lamp from around, more from above, turn normals towards the middle of the lights."""
+    room = 0.3 / np.pi * SCENE.albedo * (0.5 + 0.2 * SCENE.normal[..., 1:2])
+    result = solved(tmp_path, SCENE._replace(images=SCENE.images + room * SCENE.irradiance.mean()), Method.LAMBERT)
+    assert any(each.startswith("frames: the images look to share light") for each in result.warnings)
+    mask = result.maps.estimated
+    off = angles_degrees(result.maps.normal[mask], SCENE.normal[mask])
+    assert np.median(off) > 5 and 0.5 < np.median(off / result.maps.sigma[mask]) < 1.2  # σ holds the turn, and little beside it
+
+
 def test_an_outline_that_points_inwards_is_said_where_nothing_decides(tmp_path):
     """Lights near the view axis cast no shadow in a hollow, so that an object under inverted lights may be one."""
     scene = ellipsoid(largest_degrees=12)
