@@ -22,6 +22,10 @@ LOW, LEAST_LEVEL = 0.05, 0.04
 """Quantile of the least reading in shadow of each pixel, over what a lamp gives that it faces, and the least value from which on all images
 share light: .017 at most on 126 right captures of matt, glossy and metal objects with folds and hollows, and .07 of a metal relief."""
 
+ALIKE, MOST_PART = 0.5, 1.5
+"""Least median of the constants of all pixels, over that of those in shadow: near lamps, declared distant, reach where a few pixels seem to
+lie in shadow (.1). And the largest: brighter rooms hide the lamps, and images that a phone adapts in brightness look so (2.4)."""
+
 
 class SteadyLight(NamedTuple):
     """Light that all images share."""
@@ -61,5 +65,8 @@ def fit_steady_light(readings: np.ndarray, usable: np.ndarray, directions: np.nd
     several = dark.sum(axis=0) > 1
     range_ = float(np.median((highest - lowest)[several])) if several.any() else 0.0
     told = dark.any(axis=0)
-    in_shadow = None if told.sum() < LEAST_PIXELS else bool(np.quantile(lowest[told], LOW) > max(LEAST_LEVEL, range_))
-    return SteadyLight(Fit(vector[:3], residual, lit), vector[3] / length, in_shadow)
+    part, in_shadow = vector[3] / length, None
+    if told.sum() >= LEAST_PIXELS:
+        least = float(np.quantile(lowest[told], LOW))
+        in_shadow = least > max(LEAST_LEVEL, range_) and bool(ALIKE * least < np.median(part) < MOST_PART)
+    return SteadyLight(Fit(vector[:3], residual, lit), part, in_shadow)
