@@ -20,6 +20,8 @@ SHARP_RADIUS_DEGREES = 2.0
 other samples is interpolated from the captured lights around them."""
 
 
+RADIANS, SAME_TURN = (np.pi / 2, np.pi, 2 * np.pi, 4 * np.pi), 0.002
+"""Turns in radians, and the part by which a turn in degrees is near one, with which it is said: 1.57, 3.14 and 6.28 are."""
 FEW_ROWS = 16
 """Number of rows below which it is said that texels count by their middle, which makes an even map of 16 rows 0.2 % brighter."""
 
@@ -47,12 +49,12 @@ class EnvironmentMap:
 class Environments:
     """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
-    def __init__(self, pattern: Path, *, clip_negative: bool = False) -> None:
-        """Keep the path of the maps, as it was given.
+    def __init__(self, pattern: Path, *, clip_negative: bool = False, spin_degrees: float = 0.0) -> None:
+        """Keep the path of the maps, as it was given, and how far they turn.
 
         With `clip_negative`, values that are negative beyond the noise of their map are set to 0; else such maps are refused.
         """
-        self._pattern = pattern
+        self._pattern, self._spin_degrees = pattern, spin_degrees
         self._sequence = "#" in str(pattern) and not pattern.is_file()
         self.clipped: dict[str, int] | None = {} if clip_negative else None
         """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
@@ -93,6 +95,10 @@ class Environments:
         found = outside_sentences(self.outside, "environment", "the working space",
                                   "give images, or lamps, in a wider space, or a map without such colours")
         found += [*full_sentences(self._full), *list(self._encodings.values())[:1], *multiplied_sentences(self._multiplied)]
+        for turn in RADIANS:
+            if abs(abs(self._spin_degrees) / turn - 1) < SAME_TURN:
+                found.append(f"--spin-degrees {self._spin_degrees:g}: looks like a turn in radians, and is taken in degrees: give "
+                             f"{np.copysign(np.degrees(turn), self._spin_degrees):.0f} for that turn")
         fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
         if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
             half = np.pi / (2 * rows)

@@ -43,19 +43,20 @@ class PlanRow(NamedTuple):
     """The name of the rig; none where lamps are spread evenly."""
 
 
-def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[PlanRow]:
-    """Judge domes under environments, and write plan.csv and plan.png.
+def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> tuple[list[PlanRow], list[str]]:
+    """Judge domes under environments, write plan.csv and plan.png, and return their rows, and what is doubtful about the environments.
     Raises StageError if a map or a rig cannot be used. Raises StorageError if a file cannot be read or written."""
     timings = Timings(progress)
     given_rigs = [read_rig(path) for path in request.rigs]
     domes = [("", fibonacci_sphere(count)) for count in request.lights] + [(rig.name, rig.directions) for rig in given_rigs]
     timings.stage("plan", len(request.environment) * len(domes))
     normals = fibonacci_sphere(NORMALS)
-    rows = []
+    rows, doubts = [], []
     for path in request.environment:
         environments = Environments(path)
         environments.check([1])
         environment = environments.read(environments.path(1), SPACE)
+        doubts += environments.doubts()
         direction, energy = environment_samples(environment)
         wanted = [irradiance_of(direction, energy, normals), *(_lobe(direction, energy, normals, roughness) for roughness in ROUGHNESS)]
         for name, lamps in domes:
@@ -71,7 +72,7 @@ def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[
         [row.environment, row.lights, *(f"{100 * error:.4g}" for error in (row.irradiance, *row.highlights)), row.rig] for row in rows)))
     _plot(rows, request.out / "plan.png")
     timings.close()
-    return rows
+    return rows, doubts
 
 
 def _lobe(direction: np.ndarray, energy: np.ndarray, normals: np.ndarray, roughness: float) -> np.ndarray:

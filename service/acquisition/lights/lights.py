@@ -1,14 +1,18 @@
 """The interface that every way to switch lamps has, and the lamps of a rig, each switched by the way of its address."""
 
+import hashlib
+import socket
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from service.errors import RequestError
-from stage.rig.rig import Rig
+from stage.rig.rig import DMX, Address, Rig
 
 ADAPTERS = {"sacn": "dmx", "artnet": "dmx", "serial": "serial_line", "http": "http_requests", "manual": "by_hand"}
 """The module of each protocol of an address. A new one is a module with a function `open_switch(path, rig, ask)`, and an entry here."""
@@ -38,8 +42,10 @@ class Lights:
         `path`: of the rig, for messages. `ask`: asks the person who holds a lamp. Raises RequestError if a package or a device is missing.
         Raises ManifestError if a lamp has no address, or one that cannot be used."""
         self._switches: list[Switch] = []
+        self._held = ExitStack()
         protocols = {lamp.address.protocol for lamp in rig.lights if lamp.address is not None}
         try:
+            self._hold(path, rig)
             for module in sorted({ADAPTERS[protocol] for protocol in protocols}):
                 try:
                     adapter = import_module(f"service.acquisition.lights.{module}")
@@ -65,8 +71,26 @@ class Lights:
             except RequestError as error:
                 refused = refused or error
         self._switches.clear()
+        self._held.close()
         if refused is not None:
             raise refused
+
+    def _hold(self, path: Path, rig: Rig) -> None:
+        """Refuse lamps that another capture on this machine switches: each would take pictures under the light of the other."""
+        for place in sorted({_place(rig, lamp.address) for lamp in rig.lights if lamp.address is not None} - {""}):
+            name = f"\0relit lamps {hashlib.sha256(place.encode()).hexdigest()}"  # no file, and free when the process has ended
+            try:
+                self._held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)).bind(name)
+            except OSError as error:
+                raise RequestError(f"{path}: lights[].address: the lamps of {place} are switched by another capture on this machine: wait "
+                                   "until that has ended, or stop it") from error
+
+
+def _place(rig: Rig, address: Address) -> str:
+    """Return what lamps that one program at a time can switch have in common; empty: a person holds the lamp, or the port is exclusive."""
+    if address.protocol in DMX:
+        return f"{address.protocol} universe {address.universe}" + (f" at {address.host}" if address.host else "")
+    return urlsplit(rig.controllers.http.on.url).netloc if address.protocol == "http" and rig.controllers.http is not None else ""
 
 
 def lamp_levels(rig: Rig, levels: np.ndarray, protocols: Sequence[str]) -> dict[int, float]:

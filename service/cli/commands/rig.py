@@ -91,13 +91,15 @@ def _sweep(request: RigSweepRequest) -> None:
     print(f"table    {made.table}")
 
 
-def _plan(rows: Any, request: RigPlanRequest) -> None:
+def _plan(found: Any, request: RigPlanRequest) -> None:
     print(f"table    {request.out / 'plan.csv'}")
     print(f"plot     {request.out / 'plan.png'}")
+    rows, doubts = found
     for row in rows:
         highlights = ", ".join(f"{100 * error:.2g}" for error in row.highlights)
         of = f" of {row.rig}" if row.rig else ""
         print(f"{row.lights:>6} lamps{of} under {row.environment}: irradiance {100 * row.irradiance:.2g} %, highlights {highlights} %")
+    print_warnings(doubts)
 
 
 def _play(request: PlayRequest) -> None:

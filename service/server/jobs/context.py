@@ -197,7 +197,8 @@ def file_within(capture: Path, name: str, field: str) -> Path:
 
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:
-    """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know."""
+    """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know: a
+    file of the job itself by its name, and one of another by its identifier."""
     names = {f"{context.settings.data}/": ""}
     for row in intakes.read_by(context.database, job):
         names |= {f"{root}/": "" for root in context.settings.roots_of(row["project"])}
@@ -205,6 +206,7 @@ def without_places(text: str, job: str, context: WorkerContext) -> str:
             names[row["folder"]] = row["id"] if row["kind"] == CAPTURE else Path(row["folder"]).name
     for place in sorted(names, key=len, reverse=True):
         text = text.replace(place, names[place])
+    text = re.sub(r"\bprojects/[^/\s]+/(?:captures|environments|jobs)/", "", text).replace(f"{job}/", "")
     return re.sub(rf"{re.escape(tempfile.gettempdir())}/relit-[^/\s]+/", "", text)  # folders that a step made of links to results
 
 

@@ -8,7 +8,7 @@ import sys
 import threading
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from unittest import mock
 from urllib.parse import urlsplit
@@ -19,13 +19,15 @@ import pytest
 from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
+from service.acquisition.lights.lights import Lights
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
 from stage.errors import StageError
 from stage.importers.camera_options import View
-from tests.scenes.captures import make_scene, write_exr
-from tests.scenes.patched_rigs import write_plan
+from stage.rig.rig import read_rig
+from tests.scenes.captures import make_scene, ring, write_exr
+from tests.scenes.patched_rigs import loopback, write_plan, write_rig_file
 from tests.service.answering import Asked, answering
 from tests.service.full_disk import files_of_at_most
 from tests.service.twin_program import ROOT
@@ -134,6 +136,16 @@ def test_by_hand_each_lamp_is_asked_for_and_a_capture_that_is_there_is_not_taken
     assert all(f"L{index} " in stage.asked[index] for index in range(LAMPS))
     check(tmp_path / "capture", stage)
     assert acquire(request(tmp_path, stage, rig), ask).taken == 0
+
+
+def test_lamps_that_another_capture_switches_are_refused(tmp_path):
+    """Each of two captures, of different folders, took pictures under the lamps of both."""
+    path = write_rig_file(tmp_path / "rig.json", ring(2), host=loopback())
+    with closing(Lights(path, read_rig(path), refuse_to_ask)):
+        other = write_rig_file(tmp_path / "other.json", ring(3), host=loopback())
+        with pytest.raises(RequestError, match=r"other\.json: .* of sacn universe 1 at 127[.0-9]+ are switched by another capture"):
+            Lights(other, read_rig(other), refuse_to_ask)
+    Lights(other, read_rig(other), refuse_to_ask).close()
 
 
 def test_a_serial_board_is_told_and_answers_and_is_dark_at_the_end(tmp_path, stage):

@@ -32,6 +32,18 @@ def test_too_few_rows_are_said(tmp_path, rows, words):
     assert [words in sentence for sentence in found] == [True] if words else found == []
 
 
+@pytest.mark.parametrize(("spin", "words"), [(6.28, "give 360"), (-3.1416, "give -180"), (360, None), (6, None), (0, None)])
+def test_turns_in_radians_are_said(tmp_path, spin, words):
+    found = Environments(tmp_path / "sky.exr", spin_degrees=spin).doubts()
+    assert [words in sentence for sentence in found] == [True] if words else found == []
+
+
+def test_plans_of_domes_say_what_is_doubtful_about_environments(relit, tmp_path):
+    write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))
+    said = relit("rig", "plan", "--environment", tmp_path / "sky.exr", "--lights", "8", "--out", tmp_path / "plan")
+    assert "sky.exr: has 4 rows" in said.out + said.err
+
+
 @pytest.mark.parametrize(("sun", "dtype", "said"), [(9e4, np.float16, True), (9e4, np.float32, False), (6e4, np.float16, False)])
 def test_a_sun_that_half_floats_cannot_hold_is_said(tmp_path, sun, dtype, said):
     """Two texels at the horizon of 32 × 64, each 2 sin(π/64) 2π/64 sr, hold 65504 of their 90000; the rest has 4π sr of 1."""

@@ -11,7 +11,7 @@ from service import __version__
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module
-from service.server.jobs.context import JobStep
+from service.server.jobs.context import JobStep, without_places
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
@@ -71,6 +71,12 @@ def test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left(idle_har
     jobs.finish_step(idle_harness.database, claim, NAMES[:1])
     assert made.run(claim) == DONE
     assert begun == NAMES[1:]
+
+
+def test_a_sentence_of_a_job_names_files_as_their_user_does(idle_harness):
+    folder, other = f"{idle_harness.context().settings.data}/projects/{PROJECT}/jobs", "job_00000000000000000000"
+    told = without_places(f"{folder}/job_1/maps.exr: is no EXR; {folder}/{other}/depth.exr", "job_1", idle_harness.context())
+    assert told == f"maps.exr: is no EXR; {other}/depth.exr"
 
 
 @pytest.mark.parametrize(("error", "told"), [

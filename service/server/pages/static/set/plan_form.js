@@ -54,7 +54,9 @@ function rangesOf(indices) {
 export async function start(changes = {}) {
   const times = words(exposures).map(Number);
   const chosen = chosenLamps();
-  exposures.setCustomValidity(times.every((time) => time > 0) ? "" : "Give seconds, such as 0.05, 0.2.");
+  const decimal = /^\s*\d+,\d+\s*$/.exec(exposures.value); // a decimal comma, or two whole times
+  exposures.setCustomValidity(decimal ? `Write ${decimal[0].trim().replace(",", ".")} for one time, or ${decimal[0].trim().replace(",", ", ")} for two.`
+    : times.every((time) => time > 0) ? "" : "Give seconds, such as 0.05, 0.2.");
   lights.setCustomValidity(chosen === undefined ? `Give numbers from 1 to ${lamps.length}, such as 1-12, 20.` : "");
   if ([exposures, lights, tracking].some((field) => !field.validity.valid)) byId("more").open = true;
   if (!byId("run").reportValidity()) return;
