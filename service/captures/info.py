@@ -12,13 +12,12 @@ import numpy as np
 
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.dark_lights import dark_lights, dark_sentence
-from service.light_estimation.declared_lights import facing_sentence
+from service.light_estimation.declared_lights import explanation_sentence, facing_sentence
 from service.light_estimation.explanations import (
     MIN_LIGHTS,
     PIXELS,
     Sample,
     better_explanation,
-    explanation_sentence,
     fit_manifest,
     grey_readings,
 )

@@ -7,12 +7,14 @@ from service.light_estimation.dark_lights import dark_frames, dark_sentence
 from service.light_estimation.explanations import (
     MIN_LIGHTS,
     PIXELS,
+    Cause,
+    Explanation,
     Sample,
     better_explanation,
-    explanation_sentence,
     fit_manifest,
     grey_readings,
 )
+from service.light_estimation.grey_ball import ENCODINGS
 from service.light_estimation.lambertian import Fit
 from service.light_estimation.light_axes import Grid, axes_sentence
 from stage.capture.capture import Capture
@@ -43,6 +45,43 @@ def facing_sentence(fit: Fit) -> str | None:
     return (f"frames[].light.direction: {100 * (1 - fit.facing):.0f} % of the surface would face away from the camera that sees it: with "
             f"{sign}{'xyz'[towards.axis]} as the axis towards the camera, {100 * towards.share:.0f} % face it; check the axes (x right, y "
             "up, z towards the camera), and that directions point to the light")
+
+
+def explanation_sentence(found: Explanation, sample: Sample) -> str:
+    """Return the sentence for what explains the images better than the manifest."""
+    fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
+    alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
+    measure = "`relit calibrate intensity` measures it"
+    if found.step is not None:
+        return (f"frames[].light.irradiance: from {sample.images[found.step.first]} on, all images look {found.step.factor:.2g} times as "
+                f"bright as declared beside those before it, as where exposure, gain or lamps changed there; give exposure_s, or the "
+                f"irradiance of these lights ({measure})")
+    if found.late is not None:
+        first, ahead = sample.images[found.late[0]], found.late[1] > 0
+        return (f"frames[].light: from {first} on, the images look one light {'ahead of' if ahead else 'behind'} the manifest, as where a "
+                f"picture was {'lost' if ahead else 'taken twice'}: with each light one image {'earlier' if ahead else 'later'} there, "
+                f"{fits}; check which light belongs to which image from there on")
+    return {
+        Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as "
+                       f"{ENCODINGS.get(found.space)}, {fits}; declare {found.space} if they are",
+        Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
+                      "linear space, such as lin_rec709_scene",
+        Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
+                          f"{fits}; {measure} (a missing exposure_s, and near lights that are declared distant, act alike)",
+        Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
+                                     f"missing or wrong{alike}: {fits}; declare {found.space} if they are encoded, else {measure}",
+        Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
+                          "declare the same irradiance for every light",
+        Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
+                        "belongs to which image",
+        Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
+                       "light belongs to which image",
+        Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
+                          "check which light belongs to which image, and the directions",
+        Cause.STEADY: f"frames: the images look to share light that is not that of their lamps, {100 * found.part:.0f} % of what a lamp "
+                      f"gives that a pixel faces, as light of the room or a black level: without it, {fits}; add an image with all lamps "
+                      "off as a frame of light off, or give dark",
+    }[found.cause]
 
 
 def declared_light_sentences(stack: Stack, capture: Capture, lights: DistantLights, mask: np.ndarray) -> list[str]:

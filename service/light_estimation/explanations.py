@@ -6,12 +6,13 @@ The wrong manifests leave three to a hundred times more than the right explanati
 """
 
 from enum import Enum
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from service.light_estimation.brightness_step import BrightnessStep, find_step
-from service.light_estimation.grey_ball import ENCODINGS, other_readings
+from service.light_estimation.grey_ball import other_readings
 from service.light_estimation.lambertian import (
     LEAST_APART,
     PLANE,
@@ -39,6 +40,9 @@ MIN_LIGHTS = 6
 MIN_LIGHTS_SCALED, MIN_LIGHTS_FREE = 8, 12
 """Least count of lights where their brightness, and where their directions are free: bare metal under six lights of free brightness, or
 ten of free directions, fits too well."""
+MIN_LIGHTS_LATE, LATE_EVERY, LATE_STEPS = 10, 4, 16
+"""Least count of lights where the place is free from which on they are one image off, which every fourth pixel suffices to find, at first
+among so many places: of a metal cube under eight, others fit well."""
 MIN_READINGS_FREE = 7
 """Least count of lit readings of a pixel that is judged under free directions, twice its three unknowns and one."""
 MIN_PIXELS = 60
@@ -101,6 +105,8 @@ class Explanation(NamedTuple):
     """Colour space that would declare the encoding; empty where the encoding is not the cause."""
     step: BrightnessStep | None = None
     """The change of brightness, where it is the cause."""
+    late: tuple[int, int] | None = None
+    """The first image whose light is not its own, where those before it are, and by how many lights it is off: 1 or -1."""
     part: float = 0.0
     """Median of the light that all images share, over that of a lamp which a pixel faces."""
     normal: np.ndarray | None = None  # [3, pixels] of the sample without that light
@@ -174,11 +180,7 @@ def _fit(sample: Sample, radiance: np.ndarray) -> Fit:
 
 
 def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return the opposite of the declared encoding if it explains the images.
-
-    Linear captures are decoded as if they were sRGB or a power of 2.2, where no value is above one; display-encoded ones are taken as
-    linear.
-    """
+    """Return the opposite of the declared encoding if it explains the images: sRGB or power 2.2 where no value is above one, or linear."""
     linear = is_linear(sample.color_space)
     if misfit < (LEAST_ENCODED if linear else LEAST_LEFT):
         return None
@@ -194,7 +196,7 @@ def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
 
 
 def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return the reverse order of the lights, or one that is a frame off, if it explains the images."""
+    """Return the reverse order of the lights, or one that is a frame off, from an image on if not everywhere, if it explains the images."""
     if misfit < LEAST_ORDER:
         return None
     numbers, found = np.arange(len(sample.directions)), []
@@ -202,7 +204,42 @@ def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
         fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
         if _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
-    return min(found, key=lambda one: one.left, default=None)
+    if len(numbers) >= MIN_LIGHTS_LATE:
+        late = _late(sample)
+        fit = fit_manifest(_moved(sample, *late))
+        if _explains(fit.misfit(), misfit, TIMES):
+            found.append(Explanation(Cause.SHIFTED, misfit, fit.misfit(), _angle(given, fit), late=late))
+    return min(found, key=lambda one: one.left if one.late is None else ABOUT * one.left, default=None)
+
+
+def _late(sample: Sample) -> tuple[int, int]:
+    """Return from which image on the next lights, or those before, fit best, and which of them, 1 or -1: the misfit falls towards it."""
+    few = sample._replace(radiance=sample.radiance[:, ::LATE_EVERY], usable=sample.usable[:, ::LATE_EVERY])
+
+    @cache
+    def left(first: int, by: int) -> float:
+        return fit_manifest(_moved(few, first, by)).misfit()
+
+    last, found = len(sample.directions) - 2, []
+    for by in (1, -1):
+        step = max(1, last // LATE_STEPS)
+        tried = {*range(1, last + 1, step)}
+        while step:
+            left_by = {first: left(first, by) for first in tried}
+            first = min(left_by, key=left_by.__getitem__)
+            step = step // 2
+            tried = {each for each in range(first - 2 * step, first + 2 * step + 1, max(step, 1)) if 1 <= each <= last}
+        found.append((first, by))
+    return min(found, key=lambda each: left(*each))
+
+
+def _moved(sample: Sample, first: int, by: int) -> Sample:
+    """Return a sample whose images from one on have the light after their own, or before it; without an image that then has none."""
+    light = np.arange(len(sample.directions))
+    light[first:] += by
+    told = light < len(light)
+    return sample._replace(radiance=sample.radiance[told], usable=sample.usable[told], directions=sample.directions[light[told]],
+                           irradiance=sample.irradiance[light[told]])
 
 
 def _step(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
@@ -219,10 +256,7 @@ def _step(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
 
 
 def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return a brightness of each light that explains the images, by alternating least squares between it and the normals.
-
-    Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform light intensities and exposures", ECCV 2016.
-    """
+    """Return a brightness of each light that explains the images, by alternating least squares with the normals (Cho et al., ECCV 2016)."""
     if misfit < LEAST_LEFT:
         return None
     readings = grey_readings(sample.radiance, sample.irradiance)
@@ -259,12 +293,9 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
 
 
 def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
-    """Say whether some directions explain the images where those of the manifest do not.
-
-    A Lambertian object has images of rank three whatever its lights are (Shashua 1992; Hayakawa, JOSA A 11(11), 1994). Lights and
-    surface are found by alternating least squares from the singular vectors of the pixels that most lights reach, with shadows
-    left out. A misfit is compared relative to the bright readings of each pixel, because |b| is not defined.
-    """
+    """Say whether some directions explain the images where those of the manifest do not: whatever its lights are, a Lambertian object has
+    images of rank three (Hayakawa, JOSA A 11(11), 1994), which alternating least squares find from the singular vectors of the pixels that
+    most lights reach. A misfit is compared relative to the bright readings of each pixel, because |b| is not defined."""
     readings = grey_readings(sample.radiance, sample.irradiance)
     bright = bright_readings(readings, sample.usable)
     top = np.maximum(bright, TINY)
@@ -314,35 +345,3 @@ def _steady_light(sample: Sample, given: Fit) -> tuple[Explanation, bool, bool]:
                        normal=found.fit.normal)
     shown = bool(found.in_shadow) and told.left < told.misfit
     return told, shown, found.in_shadow is not False and bool((part > 0).mean() >= STEADY_EVERYWHERE)
-
-
-def explanation_sentence(found: Explanation, sample: Sample) -> str:
-    """Return the sentence for what explains the images better than the manifest."""
-    fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
-    alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
-    measure = "`relit calibrate intensity` measures it"
-    if found.step is not None:
-        return (f"frames[].light.irradiance: from {sample.images[found.step.first]} on, all images look {found.step.factor:.2g} times as "
-                f"bright as declared beside those before it, as where exposure, gain or lamps changed there; give exposure_s, or the "
-                f"irradiance of these lights ({measure})")
-    return {
-        Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as "
-                       f"{ENCODINGS.get(found.space)}, {fits}; declare {found.space} if they are",
-        Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
-                      "linear space, such as lin_rec709_scene",
-        Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
-                          f"{fits}; {measure} (a missing exposure_s, and near lights that are declared distant, act alike)",
-        Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
-                                     f"missing or wrong{alike}: {fits}; declare {found.space} if they are encoded, else {measure}",
-        Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
-                          "declare the same irradiance for every light",
-        Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
-                        "belongs to which image",
-        Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
-                       "light belongs to which image",
-        Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
-                          "check which light belongs to which image, and the directions",
-        Cause.STEADY: f"frames: the images look to share light that is not that of their lamps, {100 * found.part:.0f} % of what a lamp "
-                      f"gives that a pixel faces, as light of the room or a black level: without it, {fits}; add an image with all lamps "
-                      "off as a frame of light off, or give dark",
-    }[found.cause]

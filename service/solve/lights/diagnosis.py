@@ -13,13 +13,12 @@ import numpy as np
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
-from service.light_estimation.declared_lights import sample_of
+from service.light_estimation.declared_lights import explanation_sentence, sample_of
 from service.light_estimation.explanations import (
     PIXELS,
     Cause,
     Sample,
     better_explanation,
-    explanation_sentence,
     fit_manifest,
     grey_readings,
 )

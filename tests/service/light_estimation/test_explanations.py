@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from service.light_estimation.explanations import Cause, Sample, better_explanation, explanation_sentence, fit_manifest
+from service.light_estimation.declared_lights import explanation_sentence
+from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest
 from service.light_estimation.lambertian import FACING, suspects
 from stage.transforms import fibonacci_sphere
 from tests.reference.microfacet import specular, unit
@@ -79,6 +80,22 @@ def test_lights_that_differ_are_no_step(change):
     sample = sample_of(readings * change[:, None], lights)
     found = better_explanation(sample, fit_manifest(sample))
     assert found is None or found.cause is not Cause.STEP
+
+
+@pytest.mark.parametrize(("first", "by", "words"), [
+    (9, 1, "one light ahead of the manifest, as where a picture was lost"),
+    (14, -1, "one light behind the manifest, as where a picture was taken twice"), (24, 1, None)])
+def test_a_picture_that_was_lost_or_taken_twice_is_named_with_its_place(first, by, words):
+    """A glossy ball, of 1 % noise: from one image on, each shows the light after that of its row of the table, or the one before it."""
+    readings, lights = ball(0.05)
+    image = np.arange(24) + by * (np.arange(24) >= first)
+    sample = sample_of(readings[image[image < 24]], lights[: (image < 24).sum()])
+    found = better_explanation(sample, fit_manifest(sample))
+    if words is None:
+        assert found is None
+    else:
+        assert found.cause is Cause.SHIFTED and found.late == (first, by)
+        assert f"frames[].light: from {first:03d}.exr on, the images look {words}" in explanation_sentence(found, sample)
 
 
 @pytest.mark.parametrize(("count", "room", "window"), [(8, 0.3, 0.5), (8, 0.15, 0.0), (24, 0.3, 0.8)])

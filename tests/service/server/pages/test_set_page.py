@@ -259,7 +259,7 @@ def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tm
         tracking.fill("")
         times.fill("1,5")
         page.get_by_role("button", name="Take the capture").click()
-        page.wait_for_function("() => document.getElementById('exposures').validationMessage === 'Write 1.5 for one time, or 1, 5 for two.'")
+        assert times.evaluate("(field) => field.validationMessage") == "Write 1.5 for one time, or 1, 5 for two."
         times.fill("0.05, 0.2")
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#problem", has_text="exposures_s").wait_for()  # a watched folder sets none without {exposure_s}
