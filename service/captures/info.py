@@ -40,6 +40,7 @@ from stage.formats import images
 from stage.formats.exif import TURNS, UPRIGHT
 from stage.stack.correction import Correction, saturation_limit
 from stage.tof.raw_frames import check_frames, read_frame
+from stage.transforms import fibonacci_sphere
 
 MOST_NAMED = 6
 """The most lights that a sentence names."""
@@ -278,15 +279,8 @@ def front_lights(directions: np.ndarray) -> FrontLights | None:
     if lowest <= 0:
         return None
     widest = float(np.degrees(np.arccos(min(lowest, 1.0))))
-    facing = (_hemisphere(NORMALS) @ directions.T > 0).sum(axis=1)
+    facing = (fibonacci_sphere(2 * NORMALS)[:NORMALS] @ directions.T > 0).sum(axis=1)
     return FrontLights(widest, widest / 2, (1 + lowest) / 2, float((facing < READINGS).mean()))
-
-
-def _hemisphere(count: int) -> np.ndarray:
-    """Return evenly spread unit directions with z above 0, [count, 3], on a spiral of the golden angle."""
-    number = np.arange(count) + 0.5
-    z, angle = number / count, np.pi * (1 + np.sqrt(5)) * number
-    return np.column_stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
 
 
 # Compare some pixels of each frame with the manifest, and report contradictions: encoding, brightness, order, single lights.

@@ -27,10 +27,15 @@ LEFT_IN = "light from there is missing; take them again, or out of the frames"
 """What is done about dark frames where images are summed."""
 
 
+def sampled(mask: np.ndarray) -> np.ndarray:
+    """Return the positions of the pixels of a sample."""
+    inside = np.flatnonzero(mask)
+    return np.asarray(inside[evenly(len(inside), PIXELS)])
+
+
 def sample_of(stack: Stack, capture: Capture, lights: DistantLights, mask: np.ndarray) -> Sample:
     """Return some pixels of a stack with what the manifest says of them. `lights`: those of the stack. `mask`: [rows, cols] bool."""
-    inside = np.flatnonzero(mask)
-    radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
+    radiance, usable = stack.pick_radiance(sampled(mask))
     times = {frame.image: frame.exposure_s or 1.0 for frame in capture.sources()}
     exposure = np.array([times[image] for image in stack.frames])
     return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space, tuple(stack.frames))

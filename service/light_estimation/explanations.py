@@ -6,7 +6,7 @@ The wrong manifests leave three to a hundred times more than the right explanati
 """
 
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -41,8 +41,7 @@ MIN_LIGHTS_SCALED, MIN_LIGHTS_FREE = 8, 12
 """Least count of lights where their brightness, and where their directions are free: bare metal under six lights of free brightness, or
 ten of free directions, fits too well."""
 MIN_LIGHTS_LATE, LATE_EVERY, LATE_STEPS = 10, 4, 16
-"""Least count of lights where the place is free from which on they are one image off, which every fourth pixel suffices to find, at first
-among so many places: of a metal cube under eight, others fit well."""
+"""Least lights where the place is free from which on they are one image off; the pixels, and first places, by which it is found."""
 MIN_READINGS_FREE = 7
 """Least count of lit readings of a pixel that is judged under free directions, twice its three unknowns and one."""
 MIN_PIXELS = 60
@@ -99,8 +98,6 @@ class Explanation(NamedTuple):
     """Residual of the explanation, likewise."""
     degrees: float
     """Median angle between the normals of the two; where no normals follow, between those of every other light and the rest."""
-    spread: float = 0.0
-    """Standard deviation of the logarithm of the brightness that the images ask for."""
     space: str = ""
     """Colour space that would declare the encoding; empty where the encoding is not the cause."""
     step: BrightnessStep | None = None
@@ -127,7 +124,7 @@ class Sample(NamedTuple):
 
 def fit_manifest(sample: Sample) -> Fit:
     """Return the fit of the readings as the manifest gives them."""
-    return _fit(sample, sample.radiance)
+    return fit_lambertian(grey_readings(sample.radiance, sample.irradiance), sample.usable, sample.directions)
 
 
 def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
@@ -175,10 +172,6 @@ def grey_readings(radiance: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("lpc,lc->lp", radiance, factors))
 
 
-def _fit(sample: Sample, radiance: np.ndarray) -> Fit:
-    return fit_lambertian(grey_readings(radiance, sample.irradiance), sample.usable, sample.directions)
-
-
 def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
     """Return the opposite of the declared encoding if it explains the images: sRGB or power 2.2 where no value is above one, or linear."""
     linear = is_linear(sample.color_space)
@@ -186,7 +179,7 @@ def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
         return None
     found: list[Explanation] = []
     for space, radiance in other_readings(sample.radiance, sample.exposure[:, None, None], sample.color_space):
-        fit = _fit(sample, radiance)
+        fit = fit_manifest(sample._replace(radiance=radiance))
         if _explains(fit.misfit(), misfit, TIMES if linear else TIMES_FREE):
             found.append(Explanation(Cause.ENCODED if linear else Cause.LINEAR, misfit, fit.misfit(), _angle(given, fit), space=space))
     if not found:
@@ -221,16 +214,11 @@ def _late(sample: Sample) -> tuple[int, int]:
         return fit_manifest(_moved(few, first, by)).misfit()
 
     last, found = len(sample.directions) - 2, []
+    step = max(1, last // LATE_STEPS)
     for by in (1, -1):
-        step = max(1, last // LATE_STEPS)
-        tried = {*range(1, last + 1, step)}
-        while step:
-            left_by = {first: left(first, by) for first in tried}
-            first = min(left_by, key=left_by.__getitem__)
-            step = step // 2
-            tried = {each for each in range(first - 2 * step, first + 2 * step + 1, max(step, 1)) if 1 <= each <= last}
-        found.append((first, by))
-    return min(found, key=lambda each: left(*each))
+        near = min(range(1, last + 1, step), key=partial(left, by=by))
+        found += [(first, by) for first in range(max(near - step, 1), min(near + step, last) + 1)]
+    return min(found, key=lambda each: left(each[0], by=each[1]))
 
 
 def _moved(sample: Sample, first: int, by: int) -> Sample:
@@ -252,7 +240,7 @@ def _step(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
         return None
     factors = step.factors(len(readings))
     fit = fit_lambertian(readings / factors[:, None], sample.usable, sample.directions)
-    return Explanation(Cause.STEP, misfit, fit.misfit(), _angle(given, fit), float(np.log(factors).std()), step=step)
+    return Explanation(Cause.STEP, misfit, fit.misfit(), _angle(given, fit), step=step)
 
 
 def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
@@ -289,7 +277,7 @@ def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None
                            irradiance=measured[known])
     spread = float(np.log(measured[known]).std(axis=0).max())
     cause = Cause.NORMALISED if spread < LEAST_SPREAD else Cause.IRRADIANCE
-    return Explanation(cause, misfit, left, _angle(given, fit_manifest(part)), spread)
+    return Explanation(cause, misfit, left, _angle(given, fit_manifest(part)))
 
 
 def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
@@ -336,12 +324,10 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
 
 def _steady_light(sample: Sample, given: Fit) -> tuple[Explanation, bool, bool]:
     """Return the light that all images share, as far as they do, whether readings in shadow show it, and whether it may be everywhere."""
-    shared = grey_readings(np.ones((len(sample.directions), 1, 3)), sample.irradiance)  # the same radiance in all images, as readings
-    shared /= shared.mean()
-    found = fit_steady_light(grey_readings(sample.radiance, sample.irradiance), sample.usable, sample.directions, shared)
-    spare = found.fit.spare | ~found.fit.spare.any()
-    part, turned = found.part[spare], degrees_between(given.normal, found.fit.normal)[spare]
-    told = Explanation(Cause.STEADY, given.misfit(), found.fit.misfit(), float(np.median(turned)), part=float(np.median(part)),
-                       normal=found.fit.normal)
-    shown = bool(found.in_shadow) and told.left < told.misfit
-    return told, shown, found.in_shadow is not False and bool((part > 0).mean() >= STEADY_EVERYWHERE)
+    readings = grey_readings(sample.radiance, sample.irradiance)
+    fit, part, in_shadow = fit_steady_light(readings, sample.usable, sample.directions, sample.irradiance)
+    spare = fit.spare | ~fit.spare.any()
+    turned = float(np.median(degrees_between(given.normal, fit.normal)[spare]))
+    told = Explanation(Cause.STEADY, given.misfit(), fit.misfit(), turned, part=float(np.median(part[spare])), normal=fit.normal)
+    shown = bool(in_shadow) and told.left < told.misfit
+    return told, shown, in_shadow is not False and bool((part[spare] > 0).mean() >= STEADY_EVERYWHERE)

@@ -1,23 +1,17 @@
 """Light that all images share and their lamps do not give, as light of the room: it reaches what is turned away from a lamp.
 
-Lambert's law and a constant are fitted to the readings of each pixel, the constant alone to those under lamps behind its surface, which
-read what other light there is. Light that bounces from other parts of the object reads otherwise under each lamp, and somewhere hardly at
-all; light of the room reads alike, and nowhere nothing.
+Lambert's law and a constant are fitted to each pixel, the constant alone to readings under lamps behind its surface. Light that bounces
+from other parts of the object differs there from lamp to lamp, and is somewhere hardly any; light of the room is alike, and nowhere none.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, Fit, fit_lambertian, least_squares, median_of
 from stage.spread import MAD_TO_SIGMA
 
-EDGE = 0.1
-"""Cosine to a lamp, or −cosine behind a surface, from which on a reading is compared: normals are wrong by some degrees."""
-ROUNDS = 4
-"""Rounds in which the readings that lie in shadow are found anew."""
-LEAST_PIXELS = 30
-"""Least count of pixels with readings in shadow."""
+EDGE, ROUNDS, LEAST_PIXELS = 0.1, 4, 30
+"""Cosine to a lamp, or −cosine behind a surface, from which on a reading is compared, as normals are wrong by some degrees; rounds in which
+the readings in shadow are found anew; and least count of pixels that have any."""
 LOW, LEAST_LEVEL = 0.05, 0.04
 """Quantile of the least reading in shadow of each pixel, over what a lamp gives that it faces, and the least value from which on all images
 share light: .017 at most on 126 right captures of matt, glossy and metal objects with folds and hollows, and .07 of a metal relief."""
@@ -27,25 +21,13 @@ ALIKE, MOST_PART = 0.5, 1.5
 lie in shadow (.1). And the largest: brighter rooms hide the lamps, and images that a phone adapts in brightness look so (2.4)."""
 
 
-class SteadyLight(NamedTuple):
-    """Light that all images share."""
-
-    fit: Fit
-    """The fit without it."""
-    part: np.ndarray  # [pixels] of what a lamp gives that the pixel faces
-    in_shadow: bool | None
-    """True if the readings in shadow show it; None where too few pixels have any."""
-
-
-def fit_steady_light(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, shared: np.ndarray) -> SteadyLight:
-    """Fit Lambert's law and a constant.
-
-    Args:
-        readings: [lights, pixels] radiance over irradiance.
-        usable: [lights, pixels] bool, True for unsaturated readings.
-        directions: [lights, 3] unit vectors to the lights.
-        shared: [lights, 1] readings of the same radiance under each light, mean 1.
-    """
+def fit_steady_light(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, irradiance: np.ndarray
+                     ) -> tuple[Fit, np.ndarray, bool | None]:
+    """Fit Lambert's law and a constant to readings [lights, pixels], as `fit_lambertian` does. `irradiance`: [lights, 3].
+    Returns the fit without the constant; the constant over what a lamp gives that the pixel faces, [pixels]; and whether the readings in
+    shadow show that all images share it, None where too few pixels have any."""
+    shared = 1 / np.maximum(irradiance.mean(axis=1, keepdims=True), 1e-12 * irradiance.max())  # what the same radiance in all images reads
+    shared /= np.median(shared)
     vector = fit_lambertian(readings, usable, np.hstack([directions, shared])).vector
     basis = np.vstack([np.hstack([directions, shared]), np.hstack([np.zeros_like(directions), shared])])  # of lit ones, of those in shadow
     twice = np.concatenate([readings, readings])
@@ -69,4 +51,4 @@ def fit_steady_light(readings: np.ndarray, usable: np.ndarray, directions: np.nd
     if told.sum() >= LEAST_PIXELS:
         least = float(np.quantile(lowest[told], LOW))
         in_shadow = least > max(LEAST_LEVEL, range_) and bool(ALIKE * least < np.median(part) < MOST_PART)
-    return SteadyLight(Fit(vector[:3], residual, lit), part, in_shadow)
+    return Fit(vector[:3], residual, lit), part, in_shadow

@@ -1,6 +1,5 @@
 """The interface that every way to switch lamps has, and the lamps of a rig, each switched by the way of its address."""
 
-import hashlib
 import socket
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -78,9 +77,8 @@ class Lights:
     def _hold(self, path: Path, rig: Rig) -> None:
         """Refuse lamps that another capture on this machine switches: each would take pictures under the light of the other."""
         for place in sorted({_place(rig, lamp.address) for lamp in rig.lights if lamp.address is not None} - {""}):
-            name = f"\0relit lamps {hashlib.sha256(place.encode()).hexdigest()}"  # no file, and free when the process has ended
-            try:
-                self._held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)).bind(name)
+            try:  # a name without a file, of 107 bytes at most, that is free when the process has ended
+                self._held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)).bind(f"\0relit lamps {place}"[:100].encode())
             except OSError as error:
                 raise RequestError(f"{path}: lights[].address: the lamps of {place} are switched by another capture on this machine: wait "
                                    "until that has ended, or stop it") from error

@@ -197,8 +197,7 @@ def file_within(capture: Path, name: str, field: str) -> Path:
 
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:
-    """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know: a
-    file of the job itself by its name, and one of another by its identifier."""
+    """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know."""
     names = {f"{context.settings.data}/": ""}
     for row in intakes.read_by(context.database, job):
         names |= {f"{root}/": "" for root in context.settings.roots_of(row["project"])}

@@ -13,9 +13,8 @@ import numpy as np
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
-from service.light_estimation.declared_lights import explanation_sentence, sample_of
+from service.light_estimation.declared_lights import explanation_sentence, sample_of, sampled
 from service.light_estimation.explanations import (
-    PIXELS,
     Cause,
     Sample,
     better_explanation,
@@ -155,7 +154,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
 
 def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None:
     """Make normals less sure by what they would be if the images were adapted in brightness from place to place."""
-    adapted = find_adapted(sample, np.stack(np.divmod(_sampled(given), given.mask.shape[1]), axis=1))
+    adapted = find_adapted(sample, np.stack(np.divmod(sampled(given.mask), given.mask.shape[1]), axis=1))
     if adapted is None:
         return
     turned = _raise_to(given, solution, adapted.fit.normal)
@@ -164,15 +163,9 @@ def _hold_adapted(given: SolveInput, sample: Sample, solution: Solution) -> None
                              "sigma holds that")
 
 
-def _sampled(given: SolveInput) -> np.ndarray:
-    """Return the positions of the pixels of `sample_of`."""
-    inside = np.flatnonzero(given.mask)
-    return np.asarray(inside[evenly(len(inside), PIXELS)])
-
-
 def _raise_to(given: SolveInput, solution: Solution, normal: np.ndarray) -> float:
     """Add to σ how far normals are from what they may be, [3, pixels] at those of the sample, and return the median of these angles."""
-    chosen = _sampled(given)
+    chosen = sampled(given.mask)
     told = np.isin(solution.status[chosen], ESTIMATED)
     if not told.any():
         return 0.0

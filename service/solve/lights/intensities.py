@@ -80,8 +80,7 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance, lights.irradiance)
     declared = fit_lambertian(readings, usable, lights.direction)
-    shared = grey_readings(np.ones((len(readings), 1, 3)), lights.irradiance)
-    if fit_steady_light(readings, usable, lights.direction, shared / shared.mean()).in_shadow:
+    if fit_steady_light(readings, usable, lights.direction, lights.irradiance)[2]:
         return _declared(lights, "the images share light that is not that of their lamps")
     step = find_step(readings, usable, lights.direction, declared)
     if step is None:

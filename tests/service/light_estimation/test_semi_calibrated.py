@@ -221,7 +221,6 @@ def test_missing_brightness_is_measured_with_how_far_the_normals_are_off():
     right = sample()
     found = explain(right._replace(irradiance=np.ones((16, 3))))
     assert found is not None and found.cause is Cause.IRRADIANCE
-    assert found.spread == pytest.approx(np.log(right.irradiance).std(axis=0).max(), rel=0.2)  # over the lights that were measured
     truth, wrong = fit_manifest(right), fit_manifest(right._replace(irradiance=np.ones((16, 3))))
     off = np.median(angles_degrees(truth.normal.T, wrong.normal.T))
     assert found.degrees == pytest.approx(off, rel=0.25)  # what the semi-calibrated fit leaves
