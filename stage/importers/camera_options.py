@@ -109,6 +109,12 @@ def select(folder: Path, selection: Selection) -> Selected:
     return Selected(tuple(wanted), mask, ambient)
 
 
+def mask_beside(folder: Path, frames: Sequence[str]) -> str | None:
+    """Return the mask of a folder whose frames a file names: mask.png, or else the only other image with the word mask in its name."""
+    found = [name for name in image_names(folder) if words_of(name) & MASK_WORDS and name not in frames]
+    return "mask.png" if "mask.png" in found else found[0] if len(found) == 1 else None
+
+
 def refuse_twins(folder: Path, names: Sequence[str]) -> None:
     """Refuse images that are one photograph, as cameras write it twice: camera raw and JPEG under one name."""
     raws = {Path(name).stem.lower(): name for name in names if path_is_raw(name)}

@@ -8,7 +8,15 @@ scale is unknown.
 from pathlib import Path
 
 from stage.errors import ManifestError
-from stage.importers.layout import image_resolution, read_lines, read_table, write_capture
+from stage.importers.camera_options import mask_beside
+from stage.importers.layout import (
+    color_space_of,
+    doubled_lights,
+    image_resolution,
+    read_lines,
+    read_table,
+    write_capture,
+)
 
 
 def import_folder(source: Path, destination: Path) -> Path:
@@ -24,13 +32,17 @@ def import_folder(source: Path, destination: Path) -> Path:
     zero = [i for i, row in enumerate(directions) if not row.any()]
     if zero:
         raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
-    mask = "mask.png" if (source / "mask.png").exists() else None
+    resolution = image_resolution(source / names[0])
+    linear = [] if color_space_of(source / names[0]) == "lin_rec709_scene" else [
+        f"color_space: {names[0]} has 8 bits and was taken as linear, as the 16 bits of the benchmark are: JPEG images and most "
+        "others of 8 bits are srgb_texture"]
     return write_capture({
         "name": source.resolve().name,
         "color_space": "lin_rec709_scene",
-        "camera": {"projection": "orthographic", "resolution": image_resolution(source / names[0])},
-        "mask": mask,
+        "camera": {"projection": "orthographic", "resolution": resolution},
+        "mask": mask_beside(source, names),
         "irradiance_scale": "relative",
+        "assumed": [*linear, *doubled_lights(names, directions.tolist(), source / "light_directions.txt")],
         "frames": [
             {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(intensity)}}
             for name, direction, intensity in zip(names, directions.tolist(), intensities.tolist(), strict=True)

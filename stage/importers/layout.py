@@ -1,11 +1,13 @@
 """The common parts of the importers: reading tables of numbers, placing images and arrays, and writing the manifest."""
 
+import codecs
 import io
 import json
 import math
 import os
 import re
 import shutil
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -74,15 +76,23 @@ def image_named(given: str, names: Sequence[str]) -> str | None:
     last = given.replace("\\", "/").rsplit("/", 1)[-1]
     if last in names:
         return last
-    stem = Path(last).stem.lower()
-    alike = [name for name in names if Path(name).stem.lower() in (stem, last.lower())]
+    stem, whole = (unicodedata.normalize("NFC", text).lower() for text in (Path(last).stem, last))
+    alike = [name for name in names if unicodedata.normalize("NFC", Path(name).stem).lower() in (stem, whole)]  # macOS takes umlauts apart
     return alike[0] if len(alike) == 1 else None
+
+
+def read_text(path: Path) -> str:
+    """Return the content of a text file in UTF-8, in UTF-16 with its mark, or in the code page of Western Windows."""
+    data = inputs.read_bytes(path)
+    try:
+        return data.decode("utf-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
     """Return the lines of a text file that are not blank, without white space around them, each with its number from 1."""
-    text = inputs.read_bytes(path).decode("utf-8-sig", "replace")
-    return [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    return [(number, line.strip()) for number, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
 
 
 def first_of(values: Mapping[str, T], names: Iterable[str]) -> T | None:
@@ -107,7 +117,7 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file."""
     try:
-        return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
+        return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise ManifestError(f"{path}: is not JSON") from error
 

@@ -1,5 +1,6 @@
 """Tables of lights: rows of CSV and text files, arrays of .mat and .npy files, and lists of JSON files."""
 
+import csv
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stage.errors import ManifestError
+from stage.formats import images
 from stage.formats.csv_table import with_point
 from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import first_of, read_json, read_lines
@@ -22,11 +24,15 @@ STRENGTH_KEYS = ("intensity", "irradiance", "strength", "rgb", "colour", "color"
 LIST_KEYS = ("lights", "directions", "positions", "light_directions", "light_positions")
 MOST = 1e300
 """Numbers from here on are no lights; JSON has integers of any length."""
-NUMBER_KEYS = ("id", "index", "idx", "number", "num", "no", "no.", "nr", "nr.", "#", "n", "light", "led", "lamp", "frame")
+NUMBER_KEYS = ("id", "index", "idx", "i", "number", "num", "no", "no.", "nr", "nr.", "#", "n", "light", "led", "lamp", "frame")
 """Headings of a column that numbers the lights."""
 COMMENTS = ("#", "%", "//")
 FLAT = 0.2
 """The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles."""
+HALF_TURN = 180.0
+"""Degrees above which a column without negative numbers is an azimuth, however long the radius beside it."""
+WHOLE, FRACTION = re.compile(r"-?\d+"), re.compile(r"0\d+")
+"""A whole number, and what stands behind a decimal comma as no whole number does."""
 
 Run = str
 """True if lights are the `rows` or the `columns` of a table of numbers."""
@@ -111,7 +117,8 @@ def _numbers(values: np.ndarray, run: Run | None, what: str) -> LightTable:
 
 
 def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
-    """Refuse a light without a direction, which `place` names."""
+    """Refuse a light without a direction, which `place` names, and angles."""
+    check_angles(table.vectors, table.what)
     for index, vector in enumerate(table.vectors):
         if not np.isfinite(vector).all() or not vector.any():
             raise ManifestError(f"{place(index)}: {' '.join(f'{value:g}' for value in vector)} is no direction and no position")
@@ -130,8 +137,8 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
     separator = next((mark for mark in (";", "\t", ",") if any(mark in line for _, line in lines)), None)
 
     def split(line: str) -> list[str]:
-        parts = [part.strip().strip('"').strip("'") for part in (line.split(separator) if separator else line.split())]
-        return parts if separator == "," else [with_point(part) for part in parts]
+        parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True)) if separator else line.split()
+        return [with_point(part.strip().strip('"').strip("'")) for part in parts]
 
     rows = [(number, split(line)) for number, line in lines]
     count = None
@@ -140,6 +147,12 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
     headings = None
     if rows and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1]):
         headings, rows = [part.lower() for part in rows[0][1]], rows[1:]
+    for number, parts in rows:
+        whole = [part for part in parts if _number(part) is not None]
+        if any(parts[len(headings):]) if headings else len(whole) in (6, 7) and all(map(WHOLE.fullmatch, whole)) and any(
+                map(FRACTION.fullmatch, whole)):
+            raise ManifestError(f"{path}: line {number}: has {len(parts)} cells" + (f" under {len(headings)} headings" if headings else "")
+                                + ": part columns by semicolons where numbers have decimal commas")
     return headings, rows, count
 
 
@@ -154,27 +167,44 @@ def _from_text(path: Path, run: Run | None) -> LightTable:
     headings, rows, count = _rows(path)
     if not rows:
         raise ManifestError(f"{path}: holds no light")
-    rows = _without_numbers(path, headings, rows)
-    table = _without_headings(path, rows, run) if headings is None else _with_headings(path, headings, rows)
-    _check_angles(table)
+    named = None if headings is None else _named(headings, rows)
+    rows = _without_numbers(path, headings, rows, named)
+    table = _without_headings(path, rows, run) if headings is None else _with_headings(path, headings, rows, named)
+    if table.strengths is not None and len(rows) > 3 and any((table.strengths[:, 0] == np.arange(len(rows)) + first).all()
+                                                             for first in (0, 1)):
+        table = table._replace(strengths=None)  # a column that numbers the lights
     if count is not None and count != len(table.vectors):
         raise ManifestError(f"{path}: says {count} lights, holds {len(table.vectors)}")
     return _checked(table, (lambda index: f"{path}: line {rows[index][0]}") if table.run == "rows" else
                     (lambda index: f"{path}: column {index + 1}"))
 
 
-def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+def _named(headings: list[str], rows: list[tuple[int, list[str]]]) -> int | None:
+    """Return the column of the names of images: that of their heading, or in which every row has the suffix of an image; else None."""
+    told = (index for index, heading in enumerate(headings) if heading in NAME_KEYS)
+    seen = (index for index in range(len(headings)) if all(Path("".join(parts[index:index + 1])).suffix.lower() in images.SUFFIXES
+                                                           for _, parts in rows))
+    return next(told, next(seen, None))
+
+
+def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[int, list[str]]], named: int | None
+                     ) -> list[tuple[int, list[str]]]:
     """Return rows without a first column that numbers the lights; under headings it stays, and is not read.
     Raises ManifestError where a column numbers them in another order: nothing says whether images come in the order of rows or numbers."""
     if headings is None:
         columns = [0] if len(rows) > 3 and all(len(parts) == len(rows[0][1]) in (4, 5, 7) for _, parts in rows) else []
     else:
-        named = any(heading in NAME_KEYS for heading in headings)
-        columns = [] if named else [index for index, heading in enumerate(headings) if heading in NUMBER_KEYS]
+        columns = [] if named is not None else [index for index, heading in enumerate(headings) if heading in NUMBER_KEYS]
     for column in columns:
         texts = [parts[column] if column < len(parts) else "" for _, parts in rows]
         numbers = [int(text) for text in texts if text.isdecimal() and len(text) < 7]
-        if len(numbers) < len(rows) or sorted(numbers) not in (list(range(len(rows))), list(range(1, len(rows) + 1))):
+        if len(numbers) < len(rows):
+            continue
+        if sorted(numbers) not in (list(range(len(rows))), list(range(1, len(rows) + 1))):
+            others = [part for _, parts in rows for part in parts[1:]]
+            if headings is None and numbers == sorted(set(numbers)) and not all(map(WHOLE.fullmatch, others)):
+                raise ManifestError(f"{path}: its first column numbers the lights {', '.join(texts[:4])} … with gaps: name the image of "
+                                    "each light, or leave the column out")
             continue
         if numbers != sorted(numbers):
             raise ManifestError(f"{path}: numbers its lights {', '.join(texts[:4])} …: put the rows into the order of the images, or name "
@@ -184,23 +214,22 @@ def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[in
     return rows
 
 
-def _check_angles(table: LightTable) -> None:
-    """Refuse two angles beside a radius, as a table of vectors."""
+def check_angles(vectors: np.ndarray, what: str) -> None:
+    """Refuse two angles beside a radius, as vectors [lights, 3]. `what`: the file, for the message."""
     for radius, angles in ((0, (1, 2)), (2, (0, 1))):
-        turn, height = np.abs(table.vectors[:, angles]).T
-        length = table.vectors[:, radius]
+        length, given = vectors[:, radius], vectors[:, angles]
+        turn, height = np.abs(given).T
         if (len(length) > 3 and np.ptp(length) == 0 and 90 < turn.max() <= 360 and height.max() <= 90
-                and length[0] < FLAT * float(np.median(np.hypot(turn, height)))):
-            raise ManifestError(f"{table.what}: its columns look like two angles and a radius of {length[0]:g}: there must be x, y and z "
+                and (length[0] < FLAT * float(np.median(np.hypot(turn, height))) or (given.min() >= 0 and turn.max() > HALF_TURN))):
+            raise ManifestError(f"{what}: its columns look like two angles and a radius of {length[0]:g}: there must be x, y and z "
                                 "of each light")
 
 
-def _with_headings(path: Path, headings: list[str], rows: list[tuple[int, list[str]]]) -> LightTable:
+def _with_headings(path: Path, headings: list[str], rows: list[tuple[int, list[str]]], name: int | None) -> LightTable:
     def column(pattern: str) -> int | None:
         return next((index for index, heading in enumerate(headings) if re.fullmatch(pattern, heading)), None)
 
     vector = [column(rf"(l|d|p|n|light|dir|direction|pos|position)?[ _.]?{axis}([ _]?\(?\[?(mm|cm|m)?\)?\]?)?") for axis in "xyz"]
-    name = next((index for index, heading in enumerate(headings) if heading in NAME_KEYS), None)
     strength = [column(rf"({letter}|{word}|(intensity|irradiance|i)[ _.]?({letter}|{word}))")
                 for letter, word in (("r", "red"), ("g", "green"), ("b", "blue"))]
     single = column("|".join((*STRENGTH_KEYS, "i")))

@@ -13,7 +13,7 @@ import numpy as np
 from stage import inputs
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
-from stage.importers.camera_options import View
+from stage.importers.camera_options import View, mask_beside
 from stage.importers.layout import (
     assumed_encoding,
     color_space_of,
@@ -25,6 +25,7 @@ from stage.importers.layout import (
     read_lines,
     write_capture,
 )
+from stage.importers.light_table import check_angles
 from stage.model import name_fault
 
 NO_UNIT = 2.0
@@ -57,7 +58,7 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
                                 "image of its own")
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
-    mask = "mask.png" if (folder / "mask.png").exists() else None
+    check_angles(np.array([frame["light"]["direction"] for frame in frames]), str(path))
     space = color_space or color_space_of(first)
     return write_capture({
         "name": path.stem,
@@ -66,7 +67,7 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
             [f"line {number} ({frame['image']})" for (number, _), frame in zip(rows, frames, strict=True)],
             [frame["light"]["direction"] for frame in frames], path)],
         "camera": (view or View()).entry(resolution),
-        "mask": mask,
+        "mask": mask_beside(folder, list(named)),
         "irradiance_scale": scale,
         "frames": frames,
     }, path, destination)
@@ -104,7 +105,7 @@ def _frame(path: Path, folder: Path, beside: list[str], number: int, row: str, i
     if (fault := name_fault(parts[0])) is not None:
         raise ManifestError(f"{path}: line {number}: the image name {fault}")
     # names often hold folders of the machine that made the file, while the images lie beside the file, converted since
-    name = parts[0].replace("\\", "/")
+    name = parts[0].strip('"').replace("\\", "/")
     with storage("read", folder / name):  # a name that is too long is an error of the file system
         relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else (
             image_named(name, beside) or name.rsplit("/", 1)[-1])

@@ -109,6 +109,19 @@ def test_an_empty_object(object_folder):
         diligent.import_folder(object_folder, object_folder)
 
 
+def test_what_is_not_as_the_benchmark_has_it_is_said(object_folder, tmp_path):
+    """Other rigs are put into its files: eight bits, a mask of another name, a row that was copied."""
+    (object_folder / "mask.png").rename(object_folder / "cat_mask.PNG")
+    for name in NAMES:
+        write_image(object_folder / name, np.full((4, 5, 3), 60, np.uint8))
+    (object_folder / "light_directions.txt").write_text(table([*DIRECTIONS[:3], DIRECTIONS[0]]))
+    diligent.import_folder(object_folder, tmp_path / "new")
+    manifest = Capture.open(tmp_path / "new").manifest
+    assert manifest.mask == "cat_mask.PNG" and manifest.color_space == "lin_rec709_scene"
+    assert [words.split(":")[0] for words in manifest.assumed] == ["color_space", "frames[].light"]
+    assert "8 bits" in manifest.assumed[0] and "001.png and 004.png" in manifest.assumed[1]
+
+
 def test_another_file_of_that_name_is_not_overwritten(object_folder, tmp_path):
     other = write_image(tmp_path / "new" / "003.png", np.zeros((9, 9), np.uint8))
     kept = other.read_bytes()
@@ -128,6 +141,20 @@ def rti(folder, lines, *, dtype=np.uint8, suffix="jpg", names=("a 1", "b", "c"))
             write_image(path, np.full((4, 5, 3), 100, dtype))
     (folder / "dome.lp").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def test_an_rti_folder_with_quoted_names_and_a_mask_of_its_own(tmp_path):
+    rti(tmp_path, ["3", '"a 1.jpg" 0 0 1', *GOOD[2:]])
+    write_image(tmp_path / "coin_mask.png", np.full((4, 5), 255, np.uint8))
+    lp.import_folder(tmp_path, tmp_path)
+    manifest = Capture.open(tmp_path).manifest
+    assert manifest.frames[0].image == "a 1.jpg" and manifest.mask == "coin_mask.png"
+
+
+def test_angles_are_no_directions(tmp_path):
+    rti(tmp_path, ["4", "a 1.jpg 350 40 1", "b.jpg 20 60 1", "c.jpg 130 80 1", "d.jpg 200 15 1"], names=("a 1", "b", "c", "d"))
+    with pytest.raises(ManifestError, match=r"dome\.lp: its columns look like two angles"):
+        lp.import_folder(tmp_path, tmp_path)
 
 
 GOOD = ["3", "a 1.jpg 0.0 0.0 1.0", "b.jpg 0.6 0 0.8", "c.jpg\t0 0.6\t0.8"]

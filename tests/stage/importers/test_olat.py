@@ -48,6 +48,11 @@ TEXTS = {
     "named.csv": "Image,X,Y,Z\n" + rows(NAMES, X, Y, Z, separator=","),
     "other_order.csv": "\ufeffz,image,lx,ly\n" + rows(Z, [f"C:\\dome\\{name}" for name in NAMES], X, Y, separator=","),
     "decimal_commas.csv": "Light;X;Y;Z\n" + rows(["L1", "L2", "L3", "L4"], X, Y, Z, separator=";").replace(".", ","),
+    "quoted.csv": "Bild,x,y,z\n" + "".join(f'"{name}","{x}","{y}","{z}"\n' for name, x, y, z in zip(
+        NAMES, *([f"{value:g}".replace(".", ",") for value in column] for column in (X, Y, Z)), strict=True)),
+    "text_order.csv": "photo,x,y,z\n" + rows(NAMES[2:] + NAMES[:2], X[2:] + X[:2], Y[2:] + Y[:2], Z[2:] + Z[:2], separator=","),
+    "counted.csv": "i,x,y,z\n" + rows(["1", "2", "3", "4"], X, Y, Z, separator=","),
+    "counted.txt": rows(X, Y, Z, ["0", "1", "2", "3"]),
     "numbered.csv": "id,x,y,z\n" + rows(["1", "2", "3", "4"], X, Y, Z, separator=","),
     "numbered.txt": rows(["0", "1", "2", "3"], X, Y, Z),
     "millimetres.csv": "file,x_mm,y_mm,z_mm\n" + rows(NAMES, *([1000 * value for value in column] for column in (X, Y, Z)), separator=","),
@@ -60,9 +65,21 @@ def test_a_table_of_text(folder, name):
     path = folder / name
     path.write_text(TEXTS[name], encoding="utf-8")
     images, directions, irradiance = lights_of(folder, path)
-    assert images == NAMES
-    assert np.allclose(directions, DIRECTIONS) and np.all(irradiance == 1)
+    order = [images.index(name) for name in NAMES]
+    assert np.allclose(directions[order], DIRECTIONS) and np.all(irradiance == 1)
     assert Capture.open(folder).manifest.irradiance_scale == "relative"
+
+
+@pytest.mark.parametrize(("encoding", "name"), [("cp1252", "Münze.jpg"), ("utf-16", "Münze.jpg"), ("utf-8", "Mu\u0308nze.jpg")])
+def test_names_with_umlauts_as_windows_and_macos_write_them(folder, encoding, name):
+    (folder / NAMES[0]).rename(folder / name)
+    (folder / "lights.csv").write_text("image,x,y,z\n" + rows(["Münze.jpg", *NAMES[1:]], X, Y, Z, separator=","), encoding=encoding)
+    assert lights_of(folder, None)[0] == [name, *NAMES[1:]]
+
+
+def test_a_plane_of_lamps_at_one_height_is_no_table_of_angles(folder):
+    (folder / "lights.csv").write_text("x,y,z\n-200,-80,350\n200,-80,350\n-200,80,350\n200,80,350\n")
+    assert len(lights_of(folder, None)[0]) == 4
 
 
 def test_lights_in_columns(folder):
@@ -155,6 +172,10 @@ def test_what_was_understood_is_told(folder):
     ("id,x,y,z\n" + rows(["4", "2", "3", "1"], X, Y, Z, separator=","), {}, r"numbers its lights 4, 2, 3, 1"),
     (rows(["4", "2", "3", "1"], X, Y, Z), {}, r"numbers its lights 4, 2, 3, 1"),
     ("-120 40 1\n30 60 1\n95 12 1\n170 80 1\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
+    ("120 40 350\n30 60 350\n195 12 350\n270 80 350\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 350"),
+    ("".join(f"{name},0,05,0,5,0,8\n" for name in NAMES), {}, "line 1: has 7 cells: part columns by semicolons where numbers"),
+    ("image,x,y,z\nIMG_2.JPG,0,5,0,3,0,8\n", {}, "line 2: has 7 cells under 4 headings: part columns by semicolons"),
+    (rows(["1", "2", "4", "5"], X, Y, Z), {}, "its first column numbers the lights 1, 2, 4, 5 … with gaps"),
     ("", {}, r"dirs\.txt: holds no light"),
     (rows(X, Y, Z), {"axes": ("right", "left", "up")}, "two of them lie on one line"),
 ])
