@@ -145,7 +145,7 @@ def _find_lights(known: LightsKnown, given: SolveInput, lights: Any,
     if isinstance(lights, PlacedLights):
         from service.solve.lights.placement import refine_places
 
-        return refine_places(given, capture, lights)
+        return refine_places(given, lights)
     if not isinstance(lights, DistantLights):
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant and near lights alone")
     from service.solve.lights.refined_lights import refine_lights

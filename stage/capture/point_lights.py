@@ -11,6 +11,9 @@ from stage.capture.manifest import FILE_NAME
 from stage.capture.polarised_pairs import check_pairs
 from stage.errors import ManifestError
 
+LEAST_SPAN = 0.01
+"""Largest distance of near lights along an axis, over the width of the object, below which one of the two is in another unit: lights so
+close together leave normals open."""
 NAMED = 4
 """The most frames that an error message names; it counts the others."""
 
@@ -96,7 +99,12 @@ def place_lights(capture: Capture) -> PlacedLights:
         field = "surface_z_m" if camera.projection == "perspective" else "pixel_size_m"
         told = " (relit solve estimates it from the images, and relight takes it from --maps)" if distance_is_missing(capture) else ""
         raise ManifestError(f"{where}: camera.{field}: is missing: near lights need the place of the surface in metres{told}")
-    centre = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask].mean(axis=0, dtype=np.float64)
+    points = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask]
+    centre, wide = points.mean(axis=0, dtype=np.float64), float(np.ptp(points, axis=0).max())
+    near = place[place[:, 3] == 1, :3]
+    if len(near) == len(place) > 2 and (apart := float(np.ptp(near, axis=0).max())) < LEAST_SPAN * wide:
+        raise ManifestError(f"{where}: frames[].light.position_m: the near lights lie within {apart:.2g} m, and the object is {wide:.2g} m "
+                            "wide: give the positions, camera.surface_z_m and camera.pixel_size_m in metres")
     _check_places(frames, place, camera, mask, str(where))
     check_pairs(capture, place)
     return PlacedLights.about(centre, place, strength, lobe)
@@ -126,4 +134,5 @@ def _check_places(frames: tuple[int, ...], place: np.ndarray, camera: Camera, ma
                             f"less than a pixel in front of it (z = {mean_z:g} m, +z is towards the viewer)")
     if front < 3 <= len(place):
         raise ManifestError(f"{where}: frames[].light.position_m: {front} of {len(place)} lights lie in front of the surface "
-                            f"(z = {mean_z:g} m, +z is towards the viewer): a normal needs three or more")
+                            f"(z = {mean_z:g} m, +z is towards the viewer), and theirs is {place[:, 2].min():.3g} to "
+                            f"{place[:, 2].max():.3g} m: a normal needs three or more; check axes and unit of the positions")

@@ -17,6 +17,7 @@ import numpy as np
 from kernels.device import to_numpy
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, degrees_between, median_of
+from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.manifest import FILE_NAME
@@ -149,7 +150,7 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
                       "frame")
     depths = np.geomspace(NEAREST * span, FARTHEST * span, TRIALS)
     costs: dict[float, np.ndarray] = {}
-    sample = near_sample(capture, stack, light_places(capture))
+    sample = near_sample(capture.camera, capture.mask(), stack, light_places(capture))
     usable = sample.usable.sum(axis=0) >= LEAST_LIT
     if usable.sum() < LEAST_PIXELS:
         raise NotTold(f"{where} do not tell it: {int(usable.sum())} of the pixels that were looked at have {LEAST_LIT} "
@@ -205,9 +206,8 @@ def _span(capture: Capture) -> float:
     return float(np.linalg.norm(places[:, None] - places, axis=2).max())
 
 
-def near_sample(capture: Capture, stack: Stack, placed: LightPlaces | PlacedLights) -> NearSample:
-    """Return pixels that are evenly spread over the object, with the lights of the stack."""
-    camera, mask = capture.camera, capture.mask()
+def near_sample(camera: Camera, mask: np.ndarray, stack: Stack, placed: LightPlaces | PlacedLights) -> NearSample:
+    """Return pixels that are evenly spread over the object, with the lights of the stack. `mask`: [rows, cols] bool, the object."""
     rows, cols = np.nonzero(mask)
     step = max(1, int(np.ceil((max(np.ptp(rows), np.ptp(cols)) + 1) / ACROSS)))
     row, col = np.mgrid[rows.min():rows.max() + 1:step, cols.min():cols.max() + 1:step]

@@ -125,11 +125,10 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
             raise_error(solution, other.degrees)
         if estimated:
             fit = fit_manifest(sample._replace(irradiance=lights.irradiance))
-    moved = find_placement(given, capture, lights) if isinstance(lights, PlacedLights) else None
+    moved = find_placement(given, lights) if isinstance(lights, PlacedLights) else None
     if moved is not None:
         solution.warnings.append(moved.sentence)
-        solution.facts["light_placement"] = {"moved_m": [float(f"{metres:.3g}") for metres in moved.moved_m],
-                                             "factor": float(f"{moved.factor:.4g}")}
+        solution.facts["light_placement"] = moved.facts
         raise_error(solution, moved.degrees)
     axes = find_axes(given, solution, lights if isinstance(lights, DistantLights) else None, fit)
     if axes is None:

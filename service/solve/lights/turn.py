@@ -16,10 +16,13 @@ from service.light_estimation.explanations import MIN_PART, PIXELS, grey_reading
 from service.light_estimation.lambertian import fit_lambertian
 from service.requests.solve import Method
 from service.solve.base.solution import Solution, SolveInput
+from service.solve.height.distance import near_sample, surface_at
+from service.solve.height.height import mean_height
 from service.solve.lights.highlight_turn import LEAST_LIGHTS, Shown, turn_by_highlights
 from service.solve.lights.slope_turn import Nearness, turn_by_slopes
 from service.solve.methods.methods import METHODS
 from stage.capture.point_lights import DistantLights, PlacedLights
+from stage.spread import MAD_TO_SIGMA
 
 Lights = TypeVar("Lights", DistantLights, PlacedLights)
 
@@ -103,9 +106,13 @@ def find_turn(given: SolveInput, lights: DistantLights | PlacedLights, solution:
 
 
 def _is_matt(given: SolveInput, lights: DistantLights | PlacedLights, solved: np.ndarray) -> bool:
-    """Return whether the readings of solved pixels [pixels of the image] bool fit Lambert's law, which many distant lights can tell."""
-    if not isinstance(lights, DistantLights) or len(lights.direction) < LEAST_LIGHTS:
+    """Return whether the readings of solved pixels [pixels of the image] bool fit Lambert's law, which many lights can tell."""
+    if len(lights.direction) < LEAST_LIGHTS:
         return False
+    if isinstance(lights, PlacedLights):
+        sample = near_sample(given.camera, given.mask, given.stack, lights)
+        near = surface_at(sample, sample.top - mean_height(given.camera), "cpu")
+        return bool(near.lit.any() and MAD_TO_SIGMA * np.median(np.abs(near.residual[near.lit])) <= LARGEST_MISFIT)
     pixels = np.flatnonzero(solved)
     radiance, usable = given.stack.pick_radiance(pixels[evenly(len(pixels), PIXELS)])
     fit = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)

@@ -205,6 +205,12 @@ def test_a_sign_turned_round_is_seen(folder):
     assert "0 of 4 lights lie in front of the surface (z = 0.02 m, +z is" in refused(folder)
 
 
+def test_lights_as_close_together_as_another_unit_makes_them(folder):
+    for index, way in enumerate(ring(4)):
+        edit_frame(folder, index, light=point(0.0002 * way + [0, 0, 0.3]))
+    assert "frames[].light.position_m: the near lights lie within 0.00017 m, and the object is" in refused(folder)
+
+
 def test_what_distant_lights_are_refused_for(folder):
     for index, x in enumerate((-0.2, -0.1, 0.1, 0.2)):
         edit_frame(folder, index, light=point([x, 0, 0.3]))
