@@ -39,6 +39,8 @@ LEAST_FRAMES = 0.7
 """The part of the frames that must agree that an outline is that of the ball: some lights stand behind it."""
 ASIDE_PX = 1.5
 """How far a named ball may lie from the outline in the images without a word, which what stands around a mirror moves by a pixel."""
+OTHER_SIZE = 1.6
+"""Ratio of the radii of a named ball and of a round outline there up to which both are one ball: lamps and windows in it are smaller."""
 LEAST_MOVE = 0.05
 """The least standard deviation of the place of the spot over the frames, relative to the radius: the lamp of the room stands still."""
 GREY_RESIDUAL = 0.1
@@ -81,7 +83,8 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
     pictures = _pictures(captures, Correction.of(captures.source), FRAMES)
     result, said = [], []
     for name, ball in zip(names, balls, strict=True):
-        outline = outline_near(camera, pictures, ball)
+        outline = outline_near(camera, pictures, ball) or next((one for one in find_outlines(camera, pictures) if _overlap(
+            camera, ball, one.ball) and max(one.ball.radius_px / ball.radius_px, ball.radius_px / one.ball.radius_px) < OTHER_SIZE), None)
         if outline is not None:
             named, seen = ((*project(camera, each.centre), each.radius_px) for each in (ball, outline.ball))
             aside = float(np.linalg.norm(np.subtract(named, seen)))
@@ -116,7 +119,8 @@ def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]
 
 def still_on(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[np.ndarray | None]:
     """Return what up to 16 frames of a capture all show on each ball, [h, w] in the box of its view; None for two frames or fewer."""
-    return [_still(frames) for frames in _seen_in(captures, correction, views)]
+    return [still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
+            for frames in _seen_in(captures, correction, views)]
 
 
 def ball_entry(ball: Ball) -> dict[str, Any]:
@@ -169,7 +173,7 @@ class _Found(NamedTuple):
 def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> _Found:
     def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
         places = []
-        still = _still(frames)
+        still = still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
         for seen in frames:
             try:
                 places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level, still=still).uv)
@@ -214,10 +218,6 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
         if is_ball(ball, view, frames):
             balls.append(ball)
     return _Found(balls, len(outlines))
-
-
-def _still(frames: Sequence[_Seen]) -> np.ndarray | None:
-    return still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
 
 
 def _seen_in(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[list[_Seen]]:

@@ -160,7 +160,8 @@ def test_one_ball_does_not_place_lights(tmp_path):
 
 
 @pytest.mark.parametrize(("camera", "kind", "circle"), [
-    ("orthographic", "mirror", "115.7,100.2,59"), pytest.param("perspective", "grey", "78.8,84.8,60.7", marks=pytest.mark.long)])
+    ("orthographic", "mirror", "115.7,100.2,59"), ("orthographic", "mirror", "117,97,73"),
+    pytest.param("perspective", "grey", "78.8,84.8,60.7", marks=pytest.mark.long)])
 def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp_path, camera, kind, circle):
     shade = chrome if kind == "mirror" else lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0)
     folder = photograph(tmp_path / "capture", camera, shade)
