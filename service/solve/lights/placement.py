@@ -102,7 +102,6 @@ class Move(NamedTuple):
         """Return whether the lights are turned."""
         return bool(self.values[4:].any())
 
-
     @property
     def turn(self) -> Turn:
         """Return the turn about the centre of the object."""
