@@ -38,7 +38,8 @@ SURE_SHARE = 0.5
 """Share of the lit pixels with a depth that can be trusted, below which the whole capture is doubted."""
 BY_CHANCE, LEAST_APART = 0.5, 0.1
 """Pixels whose lines of sight meet no light of theirs, over the sure ones of a doubted capture and over the lit ones, from which on the
-sure ones meet by chance: cameras of twice the focal length left 4 to 26 % sure, 96 % of them off by more than five deviations."""
+sure ones meet by chance: twice and half the focal length of a camera or projector left some sure in 36 of 40 simulated captures, and more
+than a tenth of them off by more than five deviations in 32."""
 ADVICE = {
     Status.MULTIPATH: "light comes by several ways, as in fog or off shiny and translucent surfaces: project a code whose stripes are all "
                       "fine (micro, modulated, xor)",
