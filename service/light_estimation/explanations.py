@@ -136,11 +136,11 @@ def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
     if shown and (encoding is None or steady.left < encoding.left):
         return steady
     step = _step(sample, given, misfit)
-    if step is not None:
+    brightness = _brightness(sample, given, misfit) if count >= MIN_LIGHTS_SCALED else None
+    if step is not None and (brightness is None or step.left <= TIMES_FREE * brightness.left):
         return step
     order = _order(sample, given, misfit)
     plain = min((found for found in (encoding, order) if found is not None), key=lambda found: found.left, default=None)
-    brightness = _brightness(sample, given, misfit) if count >= MIN_LIGHTS_SCALED else None
     if plain is not None and (brightness is None or plain.left <= ABOUT * brightness.left):
         return plain
     if brightness is not None:

@@ -82,6 +82,13 @@ def test_lights_that_differ_are_no_step(change):
     assert found is None or found.cause is not Cause.STEP
 
 
+def test_a_step_among_lights_that_all_differ_is_not_all_of_it():
+    """Lamps from the middle of the table on are weaker, and all are the weaker the lower they stand, which the step leaves."""
+    readings, lights = ball(0.0)
+    sample = sample_of(readings * (np.where(np.arange(24) < 12, 1.0, 0.6) * np.exp(2 * lights[:, 2]))[:, None], lights)
+    assert better_explanation(sample, fit_manifest(sample)).cause is Cause.IRRADIANCE
+
+
 @pytest.mark.parametrize(("first", "by", "words"), [
     (9, 1, "one light ahead of the manifest, as where a picture was lost"),
     (14, -1, "one light behind the manifest, as where a picture was taken twice"), (24, 1, None)])
