@@ -9,7 +9,7 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from service.calibrate.results import LightCaptures, digits
 from service.calibrate.solvers.apply import LitFrame, as_direction
-from service.calibrate.solvers.ball_search import find_outlines, outline_near
+from service.calibrate.solvers.ball_search import OVAL_ERROR, find_outlines, outline_near
 from service.calibrate.solvers.mirror_ball import find_spot, still_light
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, fit_circle, project, view_ball
@@ -88,13 +88,22 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
         if outline is not None:
             named, seen = ((*project(camera, each.centre), each.radius_px) for each in (ball, outline.ball))
             aside = float(np.linalg.norm(np.subtract(named, seen)))
-            ball = ball._replace(outline_error_px=float(np.hypot(ball.outline_error_px, aside)))
+            ball = ball._replace(outline_error_px=float(np.linalg.norm([ball.outline_error_px, aside, OVAL_ERROR * outline.oval_px])),
+                                 oval_px=outline.oval_px)
             if aside > ASIDE_PX:
                 (u, v), radius = fit_circle(outline.points)
                 said.append(f"{name}: lies {aside:.1f} px from the outline that the images show there, {u:.1f},{v:.1f},{radius:.1f}: what "
                             "is measured is as much less sure; leave the ball out, or give that outline")
         result.append(ball)
     return result, said
+
+
+def oval_sentences(balls: Sequence[Ball]) -> list[str]:
+    """Return a sentence for each ball whose outline is an ellipse."""
+    return [f"the ball of {ball.radius_px:.0f} px: its outline is an ellipse, {200 * ball.oval_px / ball.radius_px:.0f} % longer than "
+            "wide, as where images were resized in one direction, or a perspective camera is declared orthographic: what is measured is "
+            "as much less sure; give images with square pixels, and camera.projection, focal_px and principal_px"
+            for ball in balls if ball.oval_px]
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:

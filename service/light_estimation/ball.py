@@ -44,6 +44,8 @@ class Ball(NamedTuple):
     """The mean radius of the outline in pixels."""
     outline_error_px: float
     """The standard error of the centre of the outline in pixels."""
+    oval_px: float = 0.0
+    """How much farther from the centre than the mean the ends of its outline are, where this is an ellipse and that of no ball."""
 
 
 class BallView(NamedTuple):
@@ -209,7 +211,7 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
             ball = ball_from_outline(camera, outline[rng.choice(len(outline), 3, replace=False)], error_px=0.0)
         except CalibrationError:
             continue
-        inliers = np.abs(_distance_px(ball, camera, outline)) < INLIER_PX
+        inliers = np.abs(distance_px(ball, camera, outline)) < INLIER_PX
         if inliers.sum() > best.sum():
             best, best_ball = inliers, ball
     if best_ball is None:
@@ -227,7 +229,7 @@ def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> t
     scale, which points lie within a pixel of its outline, and the standard error of its centre in pixels."""
     for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
         ball = ball_from_outline(camera, outline[inside], error_px=0.0)
-        distance = _distance_px(ball, camera, outline)
+        distance = distance_px(ball, camera, outline)
         inside = np.abs(distance) < INLIER_PX
         if not inside.any():
             raise CalibrationError("no point of the outline lies on a circle")
@@ -247,7 +249,7 @@ def outline_points(coverage: np.ndarray) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _distance_px(ball: Ball, camera: Camera, outline: np.ndarray) -> np.ndarray:
+def distance_px(ball: Ball, camera: Camera, outline: np.ndarray) -> np.ndarray:
     """Return the distance of image points from the outline of a ball in pixels, positive outside."""
     origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
     if camera.projection == "orthographic":

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from service.light_estimation.ball import Ball, ball_from_outline, fit_circle, project, refine_outline
+from service.light_estimation.ball import Ball, ball_from_outline, distance_px, fit_circle, project, refine_outline
 from stage.capture.camera import Camera
 from stage.errors import CalibrationError
 
@@ -49,6 +49,11 @@ STEPS, CLEAR = 3, 4.0
 TRIPLES, NEAR_PX = 1000, 1.5
 """Circles of RANSAC, of which one in a million misses where a quarter of the points lies on one, and the largest distance of a point near a
 circle: a pixel, and what the ellipse of a perspective camera differs from one."""
+LEAST_OVAL, LEAST_OVAL_PX, MORE, ROUNDS = 0.02, 1.0, 0.1, 10
+"""The least part of the radius, and pixels, by which the ends of an ellipse are farther out, from which on it is none of a ball; the part
+of the radii by which it must have more than the circle has; and the rounds in which it is found from that."""
+OVAL_ERROR = 2.0
+"""The error of the centre of a circle in an ellipse over what the ends of that are farther out."""
 SAME = 0.08
 """Circles whose centres and radii differ by less than this part of the radius are one."""
 
@@ -62,10 +67,12 @@ class RoundOutline(NamedTuple):
     """The part of the radii with a point on the outline."""
     error_px: float
     """The standard error of the centre."""
+    oval_px: float
+    """As of the ball."""
 
     def place(self, camera: Camera, radius_m: float | None, z_m: float | None) -> Ball:
         """Return the ball with what is known of its size and place."""
-        return ball_from_outline(camera, self.points, error_px=self.error_px, radius_m=radius_m, z_m=z_m)
+        return ball_from_outline(camera, self.points, error_px=self.error_px, radius_m=radius_m, z_m=z_m)._replace(oval_px=self.oval_px)
 
 
 def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutline]:
@@ -147,8 +154,21 @@ def _outline_about(camera: Camera, blurred: list[np.ndarray], u: float, v: float
             continue
         share = len(np.unique(ray[inside])) / RAYS
         if share >= LEAST_SHARE and (best is None or share > best.share):
-            best = RoundOutline(points[inside], ball, share, max(error_px, ERROR_PX / share))
+            oval = _oval_px(distance_px(ball, camera, points), turn[ray, 0], ray, inside, ball.radius_px)
+            best = RoundOutline(points[inside], ball, share, math.hypot(max(error_px, ERROR_PX / share), OVAL_ERROR * oval), oval)
     return best
+
+
+def _oval_px(away: np.ndarray, angle: np.ndarray, ray: np.ndarray, inside: np.ndarray, radius: float) -> float:
+    """Return how much farther out the ends of the ellipse are which steps of brightness lie on rather than on a circle; else 0.
+    `away`: [steps] their distances from the circle. `angle`, `ray`: [steps] about its centre. `inside`: [steps] bool, those on it."""
+    waves, near = np.stack([np.ones_like(angle), *(wave(times * angle) for times in (1, 2) for wave in (np.cos, np.sin))], axis=1), inside
+    for _ in range(ROUNDS):
+        fit = np.linalg.lstsq(waves[near], away[near])[0]
+        near = np.abs(away - waves @ fit) < NEAR_PX
+    oval = float(np.hypot(*fit[3:]))
+    more = len(np.unique(ray[near])) - len(np.unique(ray[inside])) >= MORE * RAYS
+    return oval if more and oval >= max(LEAST_OVAL_PX, LEAST_OVAL * radius) else 0.0
 
 
 def _steps(slope: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
