@@ -173,6 +173,10 @@ def _manifest(folder: str | Path, name: str, camera: Camera, frames: list[Frame]
     return path
 
 
+MEDIAN_PER_SIGMA = 0.674490
+"""The median of the absolute error over its standard deviation, for a normal error."""
+
+
 def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
     """Return the least standard deviation that an unbiased estimate of the range of each pixel can have.
 
