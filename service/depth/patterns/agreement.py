@@ -125,7 +125,8 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
         lit &= solution.status != Status.OUT_OF_RANGE
     sure = lit & np.isin(solution.status, SOLVED) & (right >= LIKELY)
     share = sure.sum() / max(int(lit.sum()), 1)
-    declared = not any(sentence.startswith(("frames:", "projector.camera_from_projector:")) for sentence in warnings)
+    fields = ("frames:", "projector.camera_from_projector:") if isinstance(solution, DepthSolution) else ("frames:",)  # places need no pose
+    declared = not any(sentence.startswith(fields) for sentence in warnings)
     if not declared:
         right = np.minimum(right, DOUBTED)
     elif lit.sum() >= ENOUGH and share < SURE_SHARE:
