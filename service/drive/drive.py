@@ -84,7 +84,8 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     keys = None if request.keys is None else LightKeys.read(request.keys)
     if keys is not None and keys.captured:
         raise RequestError(f"--keys {request.keys}: has captured images, which lamps cannot show: take them out")
-    environments = None if request.environment is None else Environments(request.environment, clip_negative=request.clip_negative)
+    environments = None if request.environment is None else Environments(request.environment, clip_negative=request.clip_negative,
+                                                                         spin_degrees=request.spin_degrees)
     scheduled = schedule(request, numbers, keys, environments)
     if environments is not None:
         environments.check(numbers)

@@ -49,12 +49,12 @@ class EnvironmentMap:
 class Environments:
     """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
-    def __init__(self, pattern: Path, *, clip_negative: bool = False) -> None:
-        """Keep the path of the maps, as it was given.
+    def __init__(self, pattern: Path, *, clip_negative: bool = False, spin_degrees: float = 0.0) -> None:
+        """Keep the path of the maps, as it was given, and how far they turn over a range of frames, for what is doubtful about that.
 
         With `clip_negative`, values that are negative beyond the noise of their map are set to 0; else such maps are refused.
         """
-        self._pattern, self.spin_degrees = pattern, 0.0
+        self._pattern, self._spin_degrees = pattern, spin_degrees
         self._sequence = "#" in str(pattern) and not pattern.is_file()
         self.clipped: dict[str, int] | None = {} if clip_negative else None
         """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
@@ -96,9 +96,9 @@ class Environments:
                                   "give images, or lamps, in a wider space, or a map without such colours")
         found += [*full_sentences(self._full), *list(self._encodings.values())[:1], *multiplied_sentences(self._multiplied)]
         for turn in RADIANS:
-            if abs(abs(self.spin_degrees) / turn - 1) < SAME_TURN:
-                found.append(f"--spin-degrees {self.spin_degrees:g}: looks like a turn in radians, and is taken in degrees: give "
-                             f"{np.copysign(np.degrees(turn), self.spin_degrees):.0f} for that turn")
+            if abs(abs(self._spin_degrees) / turn - 1) < SAME_TURN:
+                found.append(f"--spin-degrees {self._spin_degrees:g}: looks like a turn in radians, and is taken in degrees: give "
+                             f"{np.copysign(np.degrees(turn), self._spin_degrees):.0f} for that turn")
         fewest = min(self._rows, key=lambda name: self._rows[name], default=None)
         if fewest is not None and (rows := self._rows[fewest]) < FEW_ROWS:
             half = np.pi / (2 * rows)

@@ -96,7 +96,8 @@ def make_plan(request: RelightRequest) -> Plan:
     if request.report is not None:
         outputs.append((f"--report {request.report}", request.report))
     keys = LightKeys.read(request.keys) if request.keys is not None else None
-    environments = Environments(request.environment, clip_negative=request.clip_negative) if request.environment is not None else None
+    environments = None if request.environment is None else Environments(request.environment, clip_negative=request.clip_negative,
+                                                                         spin_degrees=request.spin_degrees)
     scheduled = schedule(request, numbers, keys, environments)
     groups = group_names(environments is not None, keys) if Layer.LIGHTS in request.aov else ()
     if environments is not None:

@@ -73,8 +73,6 @@ def schedule(request: RelightRequest | DriveRequest, numbers: Sequence[int], key
         raise RequestError(f"{option} turns an environment: give --environment MAP too")
     if turned and request.spin_degrees:
         raise RequestError(f"--spin-degrees {request.spin_degrees:g} and --keys {request.keys} both turn the environment: give one")
-    if environments is not None:
-        environments.spin_degrees = request.spin_degrees
     result = []
     for index, number in enumerate(numbers):
         environment = None

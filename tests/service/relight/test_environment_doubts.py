@@ -34,8 +34,7 @@ def test_too_few_rows_are_said(tmp_path, rows, words):
 
 @pytest.mark.parametrize(("spin", "words"), [(6.28, "give 360"), (-3.1416, "give -180"), (360, None), (6, None), (0, None)])
 def test_turns_in_radians_are_said(tmp_path, spin, words):
-    environments = Environments(tmp_path / "sky.exr")
-    environments.spin_degrees = spin
+    environments = Environments(tmp_path / "sky.exr", spin_degrees=spin)
     found = environments.doubts()
     assert [words in sentence for sentence in found] == [True] if words else found == []
 
