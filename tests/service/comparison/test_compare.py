@@ -299,6 +299,7 @@ def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part, si
     assert found[0].regions == found[1].regions
 
 
+@pytest.mark.long
 def test_a_mesh_whose_triangles_have_corners_of_their_own_is_compared_as_one_that_shares_them(tmp_path):
     fine = machined_part(121, 76)
     design, normals = write_stl(tmp_path / "part.stl", fine), np.zeros_like(fine.points)

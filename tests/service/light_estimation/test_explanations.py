@@ -154,7 +154,7 @@ def coin(roughness, dielectric, count=40):
     return readings * (1 + 0.005 * draw.normal(size=readings.shape)), lights
 
 
-@pytest.mark.parametrize("roughness", [0.3, 0.5])
+@pytest.mark.parametrize("roughness", [0.3, pytest.param(0.5, marks=pytest.mark.long)])
 @pytest.mark.parametrize("dielectric", [True, False])
 def test_a_coin_whose_highlight_is_smooth_over_the_lights_is_accused_of_nothing(roughness, dielectric):
     readings, lights = coin(roughness, dielectric)

@@ -100,7 +100,8 @@ def test_scans_of_another_scale_than_their_poses_are_named_so(tmp_path):
         fuse_scans(write_scans(tmp_path, shots), tmp_path / "out")
 
 
-@pytest.mark.parametrize(("count", "left_out"), [(12, True), pytest.param(9, False, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "left_out"), [(12, True), (9, False)])
 def test_a_scan_that_is_turned_by_90_degrees_is_told_by_what_others_saw_through(tmp_path, count, left_out):
     """Its surface lies near that of others only where it agrees with them by chance: it was fused with them, without a word. Where one
     other alone saw through it, nothing tells which of the two is wrong."""

@@ -176,6 +176,7 @@ def test_a_turned_scan_that_no_camera_contradicts_is_not_joined():
         assert np.degrees(np.linalg.norm(off(views, found)[:, :3], axis=1)).max() < 0.1
 
 
+@pytest.mark.long
 def test_outliers_do_not_move_poses():
     views = seen(figure, 0, 40)
     scans = []

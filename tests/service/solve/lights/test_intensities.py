@@ -138,7 +138,7 @@ def highlight(normal, directions):
     return np.maximum(normal @ (half / np.linalg.norm(half, axis=1, keepdims=True)).T, 0).transpose(2, 0, 1) ** 12
 
 
-@pytest.mark.parametrize("wrong", [0, 0.3])
+@pytest.mark.parametrize("wrong", [pytest.param(0, marks=pytest.mark.long), 0.3])
 def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_path, wrong):
     """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were
     8° off, and sure. Where lights are wrong beside it, that is said, and σ holds it."""
