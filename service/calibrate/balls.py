@@ -128,8 +128,7 @@ def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]
 
 def still_on(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[np.ndarray | None]:
     """Return what up to 16 frames of a capture all show on each ball, [h, w] in the box of its view; None for two frames or fewer."""
-    return [still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
-            for frames in _seen_in(captures, correction, views)]
+    return [_still(frames) for frames in _seen_in(captures, correction, views)]
 
 
 def ball_entry(ball: Ball) -> dict[str, Any]:
@@ -182,7 +181,7 @@ class _Found(NamedTuple):
 def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> _Found:
     def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
         places = []
-        still = still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
+        still = _still(frames)
         for seen in frames:
             try:
                 places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level, still=still).uv)
@@ -227,6 +226,10 @@ def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen
         if is_ball(ball, view, frames):
             balls.append(ball)
     return _Found(balls, len(outlines))
+
+
+def _still(frames: Sequence[_Seen]) -> np.ndarray | None:
+    return still_light([seen.radiance for seen in frames], [seen.saturated for seen in frames])
 
 
 def _seen_in(captures: LightCaptures, correction: Correction, views: Sequence[BallView]) -> list[list[_Seen]]:

@@ -41,7 +41,8 @@ MIN_LIGHTS_SCALED, MIN_LIGHTS_FREE = 8, 12
 """Least count of lights where their brightness, and where their directions are free: bare metal under six lights of free brightness, or
 ten of free directions, fits too well."""
 MIN_LIGHTS_LATE, LATE_EVERY, LATE_STEPS = 10, 4, 16
-"""Least lights where the place is free from which on they are one image off; the pixels, and first places, by which it is found."""
+"""Fewer lights than the first are not asked from which image on they are one image off: those of a metal cube under eight fitted elsewhere.
+The place is sought by one of LATE_EVERY pixels, first among LATE_STEPS places."""
 MIN_READINGS_FREE = 7
 """Least count of lit readings of a pixel that is judged under free directions, twice its three unknowns and one."""
 MIN_PIXELS = 60
@@ -244,7 +245,10 @@ def _step(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
 
 
 def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return a brightness of each light that explains the images, by alternating least squares with the normals (Cho et al., ECCV 2016)."""
+    """Return a brightness of each light that explains the images, by alternating least squares between it and the normals.
+
+    Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform light intensities and exposures", ECCV 2016.
+    """
     if misfit < LEAST_LEFT:
         return None
     readings = grey_readings(sample.radiance, sample.irradiance)

@@ -7,6 +7,7 @@ from other parts of the object differs there from lamp to lamp, and is somewhere
 import numpy as np
 
 from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, Fit, fit_lambertian, least_squares, median_of
+from service.light_estimation.semi_calibrated import TINY
 from stage.spread import MAD_TO_SIGMA
 
 EDGE, ROUNDS, LEAST_PIXELS = 0.1, 4, 30
@@ -15,7 +16,6 @@ the readings in shadow are found anew; and least count of pixels that have any."
 LOW, LEAST_LEVEL = 0.05, 0.04
 """Quantile of the least reading in shadow of each pixel, over what a lamp gives that it faces, and the least value from which on all images
 share light: .017 at most on 126 right captures of matt, glossy and metal objects with folds and hollows, and .07 of a metal relief."""
-
 ALIKE, MOST_PART = 0.5, 1.5
 """Least median of the constants of all pixels, over that of those in shadow: near lamps, declared distant, reach where a few pixels seem to
 lie in shadow (.1). And the largest: brighter rooms hide the lamps, and images that a phone adapts in brightness look so (2.4)."""
@@ -32,13 +32,13 @@ def fit_steady_light(readings: np.ndarray, usable: np.ndarray, directions: np.nd
     basis = np.vstack([np.hstack([directions, shared]), np.hstack([np.zeros_like(directions), shared])])  # of lit ones, of those in shadow
     twice = np.concatenate([readings, readings])
     for _ in range(ROUNDS):
-        length = np.maximum(np.linalg.norm(vector[:3], axis=0), 1e-200)
+        length = np.maximum(np.linalg.norm(vector[:3], axis=0), TINY)
         cosine = directions @ vector[:3] / length
         chosen = np.concatenate([usable & (cosine > EDGE), usable & (cosine < -EDGE)])
         residual = np.where(chosen, twice - basis @ vector, 0) / length
         spread = MAD_TO_SIGMA * median_of(np.abs(residual), chosen) + LEAST_SPREAD
         vector = least_squares(twice, chosen / (1 + (residual / (CAUCHY * spread)) ** 2), basis)
-    length = np.maximum(np.linalg.norm(vector[:3], axis=0), 1e-200)
+    length = np.maximum(np.linalg.norm(vector[:3], axis=0), TINY)
     cosine = directions @ vector[:3] / length
     lit, dark = usable & (cosine > EDGE), usable & (cosine < -EDGE)
     residual = np.where(lit, readings - basis[: len(readings)] @ vector, 0) / length

@@ -41,7 +41,7 @@ TRIED_PIXELS = 600
 DISTANCES = tuple(np.geomspace(0.8, 16, 14).tolist())
 """Distances from the middle of the object that are tried, in its half widths, 26 % apart."""
 EVERY = 3
-"""Of them one of so many is tried first, and then those about the best."""
+"""Every so many of these distances is tried first; then those on both sides of the best one are."""
 LEAST_LIGHTS, LEAST_LIT = 5, 5
 """Least count of lights, and of lit readings of a pixel that is compared: two to spare."""
 LEAST_PIXELS = 60
