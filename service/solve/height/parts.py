@@ -23,7 +23,7 @@ from stage.capture.point_lights import DistantLights
 SWEEPS = 3
 """Most times that every part is moved: each moves against the others where these lie now."""
 SETTLED = 0.25
-"""Change of an offset, in its σ, below which the sweeps end."""
+"""Change of an offset, in its σ, below which the other parts are not judged again."""
 NOWHERE = Offset(0.0, math.inf, 0.0, 0.0, 0.0, 0.0)
 """The offset of a part that has not been moved."""
 MANY_UNEXPLAINED = 0.1
@@ -120,24 +120,25 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     scene.show(height, part)
     found: dict[int, Offset] = {}
     contradiction: dict[int, float | None] = {}
-    for _ in range(SWEEPS):
-        restless = False
-        for number in (int(one) for one in moved):
-            step = scene.step_of(number, against=[int(order[0]), *(other for other in found if other != number)])
-            before = found.pop(number, NOWHERE)
-            if not scene.is_known(step.low, step.high):
-                if before is not NOWHERE and step.low <= 0 <= step.high:  # it was placed, and parts placed since do not contradict it
-                    found[number] = before
-                    continue
-                scene.move(number, -before.offset)
-                told = scene.is_known(step.agreed_low, step.agreed_high)
-                contradiction[number] = (step.high - step.low) / scene.size if told else None
-                continue
+    settled: set[int] = set()  # judged since any other was placed or moved: they would be placed as they were
+    for number in SWEEPS * [int(one) for one in moved]:
+        if number in settled:
+            continue
+        step = scene.step_of(number, against=[int(order[0]), *(other for other in found if other != number)])
+        before = found.pop(number, NOWHERE)
+        if scene.is_known(step.low, step.high):
             scene.move(number, step.offset)
             found[number] = step._replace(offset=step.offset + before.offset, low=step.low + before.offset, high=step.high + before.offset)
-            restless |= before is NOWHERE or abs(step.offset) > SETTLED * step.sigma
-        if not restless or len(moved) == 1:
-            break
+            restless = before is NOWHERE or abs(step.offset) > SETTLED * step.sigma
+        elif before is not NOWHERE and step.low <= 0 <= step.high:  # it was placed, and parts placed since do not contradict it
+            found[number] = before
+            restless = False
+        else:
+            scene.move(number, -before.offset)
+            told = scene.is_known(step.agreed_low, step.agreed_high)
+            contradiction[number] = (step.high - step.low) / scene.size if told else None
+            restless = before is not NOWHERE
+        settled = {number} if restless else {*settled, number}
     placed = []
     for number in (int(one) for one in order[: 1 + len(moved)]):
         row, col = (round(float(axis.mean())) for axis in np.nonzero(part == number))

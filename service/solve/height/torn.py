@@ -42,22 +42,20 @@ def tear(surface: Integration, height: np.ndarray, scene_of: Callable[[], PartSc
         return surface, height
     scene = scene_of()
     scene.show(height, fragment)
-    moved_by: dict[int, Offset] = {}
+    apart: dict[int, Offset] = {}
     main = int(np.argmax(np.bincount(part_of, weights=size)))
-    settled: set[int] = set()  # judged since anything moved last: they would be placed as they were
+    settled: set[int] = set()  # judged since anything else moved: they would be placed as they were
     for number in SWEEPS * judged[:MOST_PARTS]:
         if number in settled:
             continue
         others = np.flatnonzero((part_of == main) | (part_of == part_of[number]))
         step = scene.step_of(number, against=[int(other) for other in others if other != number])
-        before = moved_by.pop(number).offset if number in moved_by else 0.0
-        known = scene.is_known(step.low, step.high)
-        offset = step.offset if known else -before
-        scene.move(number, offset)
-        settled = set() if offset else {*settled, number}
-        if known:
-            moved_by[number] = step._replace(offset=before + step.offset)
-    apart = {number: step for number, step in moved_by.items() if abs(step.offset) > APART_SIGMAS * step.sigma}
+        before = apart.pop(number).offset if number in apart else 0.0
+        if scene.is_known(step.low, step.high) and abs(before + step.offset) > APART_SIGMAS * step.sigma:
+            apart[number] = step._replace(offset=before + step.offset)
+        moved = (apart[number].offset if number in apart else 0.0) - before
+        scene.move(number, moved)
+        settled = {number} if moved else {*settled, number}
     if not apart:
         return surface, height
     out = np.isin(fragment, list(apart))
@@ -66,13 +64,13 @@ def tear(surface: Integration, height: np.ndarray, scene_of: Callable[[], PartSc
     cuts[1][:-1] = out[1:] != out[:-1]
     found = again(cuts=cuts)
     assert found is not None
-    part, moved = found.part, to_numpy(found.height).copy()
+    part, placed = found.part, to_numpy(found.height).copy()
     assert part is not None
     for each in np.unique(part[np.isin(fragment, np.flatnonzero(np.isin(part_of, part_of[list(apart)])))]):
         mine = part == each
         number = int(np.bincount(fragment[mine]).argmax())
         behind = fragment == host[part_of[number]]
         # what was joined through a fragment that is apart stays where it was
-        before, after = (scene.level(z, mine) - scene.level(z, behind) for z in (height, moved))
-        scene.shift(moved, mine, before - after + (apart[number].offset if number in apart else 0.0))
-    return found, moved
+        before, after = (scene.level(z, mine) - scene.level(z, behind) for z in (height, placed))
+        scene.shift(placed, mine, before - after + (apart[number].offset if number in apart else 0.0))
+    return found, placed
