@@ -7,6 +7,7 @@ import { commandOf, curlOf } from "../form.js";
 import { once } from "../once.js";
 import { mount } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
+import { warningsOf } from "./results.js";
 import { mountVideo } from "./video.js";
 
 const FIRST_FRAME = 1;
@@ -87,7 +88,7 @@ export async function mountLight(parent, capture, view, environments, { canRende
 
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
   const [stage, notes] = [element("div"), element("div")];
-  parent.replaceChildren(stage, notes, canRender ? batchForm() : element("p", { class: "help" }, FOUND));
+  parent.replaceChildren(warningsOf(view), stage, notes, canRender ? batchForm() : element("p", { class: "help" }, FOUND));
   const viewer = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });
   if (viewer.over !== null) await mountAnnotations(notes, capture, viewer.over);
   mountVideo(stage.querySelector(".view-tools"), view.info.name, viewer);

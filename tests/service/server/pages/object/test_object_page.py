@@ -125,14 +125,15 @@ def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(
     expect(page.locator("#work li")).to_have_count(1)  # none of other objects
 
 
-def test_what_was_taken_for_granted_is_no_fault(page, made):
+@pytest.mark.parametrize("mode", ["photographs", "light"])
+def test_what_was_taken_for_granted_is_no_fault(page, made, mode):
     def doubtful(route):
         answer = route.fetch()
         doubts = {"findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"], "assumed": ["no lens is known"]}
         route.fulfill(response=answer, json=answer.json() | doubts)
 
     page.route("**/results/view.json", doubtful)
-    page.goto(f"{made.pages['object']}#mode=photographs")
+    page.goto(f"{made.pages['object']}#mode={mode}")
     colours = [page.get_by_text(words, exact=True).evaluate("(each) => getComputedStyle(each).color")
                for words in ("a frame is dark", "the height is steep", "no lens is known")]
     assert len(set(colours)) == 3
