@@ -13,8 +13,8 @@ from kernels.photometric.lambertian.lambert import NormalFit, solve_lambert
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.model.samples import Samples, evenly, gather
-from kernels.photometric.search.diffuse_shape import choose_diffuse
-from kernels.photometric.search.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.search.hypotheses import LobeShape, SearchOptions
+from kernels.photometric.search.lobe_shape import choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.svbrdf import SHAPE_TEMPERATURE, average_normals, solve_svbrdf
 from kernels.status import Status
@@ -45,7 +45,7 @@ class Case:
     samples: Samples
     channels: tuple[Samples, ...]
     """The same pixels with the readings of one channel as their grey."""
-    shape: Diffuse
+    shape: LobeShape
     """The shared diffuse shape, chosen on LOBE_PIXELS of them."""
     whole: Callable[[MaterialOptions], np.ndarray]
     """Solves the whole image; [n, 3] of its normals."""
@@ -77,7 +77,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     samples = _gather(band, solved, lights, factors, stack.light_count)
     channels = tuple(_gather(band, solved, lights, grey_factors(lights, one), stack.light_count) for one in np.eye(3))
     few = solved[evenly(len(solved), LOBE_PIXELS)]
-    shape = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few]).mean
+    shape = choose_lobe_shape(_gather(band, few, lights, factors, stack.light_count), robust[0][few]).mean
 
     def whole(options: MaterialOptions) -> np.ndarray:
         solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), ("cpu",), Timings(),
@@ -102,8 +102,8 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "`lambert`": lambda case: case.lambert,
     "`robust`": lambda case: case.robust,
     "hypotheses × Lambert and five GGX lobes, Cauchy weights":
-        lambda case: find_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).best.normal,
-    "+ cast shadow as a separate hypothesis": lambda case: find_normals(case.samples, case.robust, shape=Diffuse()).best.normal,
+        lambda case: find_normals(case.samples, case.robust, shape=LobeShape(), options=NO_SHADOW).best.normal,
+    "+ cast shadow as a separate hypothesis": lambda case: find_normals(case.samples, case.robust, shape=LobeShape()).best.normal,
     "+ diffuse shape shared by the object": lambda case: find_normals(case.samples, case.robust, shape=case.shape).best.normal,
     "· the same with the three channels searched separately and averaged by cost (not used)": _channels_apart,
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,

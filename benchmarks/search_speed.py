@@ -11,7 +11,7 @@ from kernels.photometric.lambertian.readings import grey_factors, grey_readings,
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.model.samples import gather
 from kernels.photometric.search.descent import descend
-from kernels.photometric.search.hypotheses import Diffuse, search_normals
+from kernels.photometric.search.hypotheses import LobeShape, search_normals
 from kernels.photometric.svbrdf import solve_svbrdf
 from stage.colour.colour import GREY_WEIGHTS
 from tests.reference import hypotheses as twin
@@ -43,11 +43,11 @@ def search_rows() -> list[str]:
     wide, fine = RINGS, ()
     candidates = len(rings(*RINGS))
     least_squares = median_seconds(lambda: solve_lambert(band, grey_readings(band, factors), lights.direction))
-    search = median_seconds(lambda: search_normals(samples, start, shape=Diffuse(), wide=wide, fine=fine))
+    search = median_seconds(lambda: search_normals(samples, start, shape=LobeShape(), wide=wide, fine=fine))
     readings = (radiance / np.median(radiance, axis=0)).T[:NUMPY_PIXELS].astype(np.float32)
     numpy = median_seconds(lambda: twin.cost(readings, start[:NUMPY_PIXELS], directions.astype(np.float32), view[:NUMPY_PIXELS]), 3)
-    descents = median_seconds(lambda: descend(samples, start, shape=Diffuse()))
-    whole = median_seconds(lambda: solve_svbrdf(samples, start, shape=Diffuse()), 3)
+    descents = median_seconds(lambda: descend(samples, start, shape=LobeShape()))
+    whole = median_seconds(lambda: solve_svbrdf(samples, start, shape=LobeShape()), 3)
     ours, theirs = PIXELS * candidates / search, NUMPY_PIXELS / numpy
     return [f"The general solver, {LIGHTS} lights, on the CPU:", "", "| | per second |", "|---|---|",
             f"| candidates judged, kernel | {ours:,.0f} |", f"| candidates judged, the same in vectorised NumPy | {theirs:,.0f} |",

@@ -11,6 +11,8 @@ Burley, "Physically-based shading at Disney", 2012, section 5.3 (diffuse).
 import warp as wp
 
 INVERSE_PI = 0.31830988618
+SHORT_TAILS = 18.0
+"""γ of the lobes with short tails: near Beckmann's, and a power by multiplications alone."""
 
 
 @wp.func
@@ -48,6 +50,33 @@ def ggx_seen(nl: float, nv: float, nh: float, alpha: float, view_root: float) ->
 def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
     """Return D · V · n·l without Fresnel; 0 for a light below the horizon."""
     return ggx_seen(nl, nv, nh, alpha, masking_root(nv, alpha))
+
+
+@wp.func
+def short_tails(nh: float, alpha: float):
+    """Return by what GGX's distribution of facets is multiplied to become one with short tails, and the derivative by nh.
+
+    GGX's is Student's t-distribution of slopes with γ = 2, and Beckmann's with γ = ∞; this is the one with γ = SHORT_TAILS.
+    Source: Ribardière et al., "STD: Student's t-distribution of slopes for microfacet based BSDFs", Computer Graphics Forum 36(2), 2017,
+    equation 12.
+    """
+    a2 = alpha * alpha
+    wide = wp.static(SHORT_TAILS - 1.0) * a2
+    rest, wide_rest = 1.0 - a2, 1.0 - wide
+    c = wp.max(nh, 1.0e-3)  # a half vector behind the surface belongs to a light that does not reach it
+    bottom = wp.max(1.0 - rest * c * c, 1.0e-9)
+    wide_bottom = wp.max(1.0 - wide_rest * c * c, 1.0e-9)
+    inverse = 1.0 / (bottom * wide_bottom * c)
+    per_nh = inverse * bottom * wide_bottom
+    per_wide = inverse * bottom * c
+    fall = wide * c * c * per_wide
+    fall2 = fall * fall
+    fall4 = fall2 * fall2
+    fall8 = fall4 * fall4
+    ratio = wp.static(SHORT_TAILS - 1.0) * bottom * per_wide
+    factor = ratio * ratio * fall8 * fall8
+    steep = wp.static(2.0 * SHORT_TAILS) * wide_rest * per_wide - 4.0 * rest * inverse * wide_bottom * c
+    return factor, factor * (steep * c + wp.static(2.0 * (SHORT_TAILS - 2.0)) * per_nh)
 
 
 @wp.func

@@ -19,7 +19,7 @@ from kernels.photometric.lambertian.readings import Lights, Readings, grey_facto
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, gather, readings_of
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.relight.basis.basis import gram, squared_residual
 from kernels.relight.directions.latlong import cut
@@ -173,7 +173,7 @@ def chosen(device: str, scene: Scene) -> Compared:
 
 def svbrdf(device: str, scene: Scene) -> Compared:
     """Normals that the general search finds on a matt surface; it is as fine as its last steps."""
-    return solve_svbrdf(scene.samples(), scene.normal.astype(np.float32), shape=Diffuse()).normal, scene.normal, 10 * HALF
+    return solve_svbrdf(scene.samples(), scene.normal.astype(np.float32), shape=LobeShape()).normal, scene.normal, 10 * HALF
 
 
 def moments(device: str, scene: Scene) -> Compared:

@@ -19,7 +19,7 @@ from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_r
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.model.samples import gather
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.relight.frames.combine import combine, combine_batch
 from kernels.structured.pattern_frames import upload
@@ -178,7 +178,7 @@ def _general(table: Table, lights: Lights, normal: np.ndarray, few: np.ndarray) 
     start = np.resize(normal, (pixels, 3))
     band = packs.upload(np.resize(few, (3, LIGHTS, pixels)) if pixels < PATTERN_PIXELS else repeated(few, pixels), device=device)
     samples = gather(band, np.arange(pixels), np.tile(np.array([0, 0, 1], dtype=np.float32), (pixels, 1)), lights, factors, LIGHTS)
-    table.row("`svbrdf`, search and material", lambda: solve_svbrdf(samples, start, shape=Diffuse()), pixels, STACK_BYTES * pixels)
+    table.row("`svbrdf`, search and material", lambda: solve_svbrdf(samples, start, shape=LobeShape()), pixels, STACK_BYTES * pixels)
 
 
 def _depths(table: Table, rng: np.random.Generator) -> None:

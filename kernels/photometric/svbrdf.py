@@ -14,6 +14,7 @@ model for physically-based rendering", Computer Graphics Forum 1994) and Burley'
 that of `hypotheses`, after Hui and Sankaranarayanan, TPAMI 2017. Averaging the normals of several models is ours.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, to_host
 from kernels.photometric.search.certainty import SingleLobe, standard_deviation
 from kernels.photometric.search.descent import WARM, descend
-from kernels.photometric.search.hypotheses import Diffuse, Prior
+from kernels.photometric.search.hypotheses import LobeShape, Prior
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.refine import refine
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE
@@ -65,7 +66,7 @@ class SvbrdfFit(NamedTuple):
     mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
 
-def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: Diffuse | None = None,
+def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe: LobeShape | None = None,
                  shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
                  beside: np.ndarray | None = None, shared_misfit: float = UNKNOWN_SHARE) -> SvbrdfFit:
@@ -124,9 +125,9 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
                      np.sqrt(found.best.cost), mixture)
 
 
-def nearby_shapes(shape: Diffuse) -> list[Diffuse]:
-    """Return the shapes of the diffuse lobe that are tried besides one; Lambert's lobe has no roughness that could differ."""
-    return [Diffuse(rough=shape.rough + rough, slope=shape.slope + slope) for rough, slope in NEIGHBOURS
+def nearby_shapes(shape: LobeShape) -> list[LobeShape]:
+    """Return the shapes that are tried besides one; Lambert's lobe has no roughness that could differ."""
+    return [replace(shape, rough=shape.rough + rough, slope=shape.slope + slope) for rough, slope in NEIGHBOURS
             if not rough or shape.rough + rough >= 0]
 
 
@@ -162,7 +163,7 @@ RING_COUNT = 6
 """Candidates on each of them."""
 
 
-def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: LobeShape) -> np.ndarray:
     """Return the angle in degrees, [n] float32, to a normal that explains the pixel about as well with the shared F0.
 
     It is 0 where F0 is not far above the shared ones, and where no such normal was found.

@@ -8,10 +8,14 @@ def unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def distribution(cosine, alpha):
-    """GGX's D of the angle between normal and half vector."""
-    tangent2 = 1 / cosine**2 - 1
-    return 1 / (np.pi * alpha**2 * cosine**4 * (1 + tangent2 / alpha**2) ** 2)
+GGX, BECKMANN = 2.0, np.inf
+
+
+def distribution(cosine, alpha, gamma=GGX):
+    """D of the angle between normal and half vector."""
+    square = (1 / cosine**2 - 1) / alpha**2
+    fall = np.exp(-square) if np.isinf(gamma) else (1 + square / (gamma - 1)) ** -gamma
+    return fall / (np.pi * alpha**2 * cosine**4)
 
 
 def smith_lambda(cosine, alpha):
@@ -20,8 +24,8 @@ def smith_lambda(cosine, alpha):
     return (np.sqrt(1 + alpha**2 * tangent2) - 1) / 2
 
 
-def specular(normal, light, view, alpha, f0):
-    """BRDF · n·l of the GGX lobe; 0 for lights below the horizon. Broadcasts over leading axes."""
+def specular(normal, light, view, alpha, f0, gamma=GGX):
+    """BRDF · n·l of a lobe; 0 for lights below the horizon. Broadcasts over leading axes."""
     half = unit(light + view)
     nl, nv = (normal * light).sum(-1), (normal * view).sum(-1)
     nh, hv = (normal * half).sum(-1), (half * view).sum(-1)
@@ -29,7 +33,7 @@ def specular(normal, light, view, alpha, f0):
     safe = np.where(lit, nl, 1.0)
     masking = 1 / (1 + smith_lambda(safe, alpha) + smith_lambda(nv, alpha))
     fresnel = f0 + (1 - f0) * (1 - hv) ** 5
-    return np.where(lit, distribution(np.maximum(nh, 1e-6), alpha) * masking * fresnel / (4 * nv), 0.0)
+    return np.where(lit, distribution(np.maximum(nh, 1e-6), alpha, gamma) * masking * fresnel / (4 * nv), 0.0)
 
 
 def diffuse(normal, light, view, rough=None, slope=0.0):

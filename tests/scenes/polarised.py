@@ -66,20 +66,10 @@ def with_two_beckmann_lobes(scene: PolarisedScene) -> PolarisedScene:
     for direction in scene.directions:
         lit = microfacet.diffuse(scene.surface.normal, direction, VIEW)[..., None] * scene.surface.mask[..., None]
         diffuse.append(IRRADIANCE * albedo * lit)
-        coat = _beckmann(scene.surface.normal, direction, 0.45, 0.08) + _beckmann(scene.surface.normal, direction, 0.12, 0.03)
+        coat = sum(microfacet.specular(scene.surface.normal, direction, VIEW, alpha, f0, microfacet.BECKMANN)
+                   for alpha, f0 in ((0.45, 0.08), (0.12, 0.03)))
         specular.append(IRRADIANCE * np.repeat((coat * scene.surface.mask)[..., None], 3, axis=-1))
     return scene._replace(albedo=albedo, diffuse=np.array(diffuse), specular=np.array(specular))
-
-
-def _beckmann(normal: np.ndarray, light: np.ndarray, alpha: float, f0: float) -> np.ndarray:
-    """BRDF · n·l of a lobe with Beckmann's distribution (Walter et al. 2007, equation 25), else as `microfacet.specular`."""
-    half = microfacet.unit(light + VIEW)
-    nl, nv, hv = (normal * light).sum(-1), (normal * VIEW).sum(-1), (half * VIEW).sum(-1)
-    nh = np.maximum((normal * half).sum(-1), 1e-6)
-    density = np.exp((1 - 1 / nh**2) / alpha**2) / (np.pi * alpha**2 * nh**4)
-    lit = nl > 1e-9
-    masking = 1 / (1 + microfacet.smith_lambda(np.where(lit, nl, 1.0), alpha) + microfacet.smith_lambda(nv, alpha))
-    return np.where(lit, density * masking * (f0 + (1 - f0) * (1 - hv) ** 5) / (4 * nv), 0.0)
 
 
 def write_polarised(folder: Path, scene: PolarisedScene, *, leak: float = 0.0, declared: float | None = None, noise: float = 0.0,

@@ -27,7 +27,7 @@ from kernels.photometric.model.lobes import direction_reflectance
 from kernels.photometric.model.misfit import PRIOR
 from kernels.photometric.model.robust_weights import WEIGHT_ROWS, Criteria, plain_weights, weigh
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
-from kernels.photometric.search.hypotheses import Diffuse, criteria
+from kernels.photometric.search.hypotheses import LobeShape, criteria
 from kernels.photometric.search.survey import INFORMATIVE, noise_of
 
 UNKNOWNS = 5
@@ -75,7 +75,7 @@ class AlbedoError(NamedTuple):
     tilt: np.ndarray  # [n, 3] change for each degree that the normal is off
 
 
-def albedo_error(samples: Samples, normal: np.ndarray, fitted: FittedMaterial, *, shape: Diffuse,
+def albedo_error(samples: Samples, normal: np.ndarray, fitted: FittedMaterial, *, shape: LobeShape,
                  shared: np.ndarray | None) -> AlbedoError:
     """Return how far the diffuse albedo of fitted materials may be off; waits for the device.
     `normal`: [n, 3] unit. `fitted`: fitted to it with this `shape`. `shared`: [materials, 4] F0 and roughness of pixels, or None."""

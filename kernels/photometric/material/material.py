@@ -35,7 +35,7 @@ from kernels.photometric.model.response_table import COLUMNS
 from kernels.photometric.model.robust_weights import WEIGHT_ROWS
 from kernels.photometric.model.samples import Samples, per_pixel, scratch_memory, to_host
 from kernels.photometric.model.tabulated_lobes import tabulated_reflectance
-from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.search.hypotheses import LobeShape, SearchOptions, criteria
 
 NEUTRAL_RISE = 1.25
 """Factor by which the cost may rise when the channels share one F0: on coloured metals it rises at least 1.3 fold and mostly several fold,
@@ -74,7 +74,7 @@ class Material(NamedTuple):
     cost: np.ndarray  # [n] float32, per light, as of the search
 
 
-def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
+def fit_material(samples: Samples, normal: np.ndarray, *, shape: LobeShape, options: SearchOptions | None = None,
                  table: wp.array | None = None, shared: np.ndarray | None = None) -> Material:
     """Fit the material of sampled pixels; waits for the device.
 
@@ -146,17 +146,17 @@ def is_dielectric(materials: np.ndarray) -> np.ndarray:
     return np.asarray((np.ptp(materials[:, :3], axis=1) == 0) & (materials[:, 0] <= BRIGHTEST_DIELECTRIC))
 
 
-def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> Material:
+def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: LobeShape) -> Material:
     """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost."""
     return _fit(samples, normal, shape, None, None, TINTED)
 
 
-def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse) -> Material:
+def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: LobeShape) -> Material:
     """Fit the albedo of sampled pixels to a specular lobe that is given: `material` is [4] F0 and roughness."""
     return _fit(samples, normal, shape, None, None, GIVEN, material)
 
 
-def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse) -> Material:
+def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: LobeShape) -> Material:
     """Fit albedo and roughness of sampled pixels to an F0 that is given, of all channels.
 
     Each roughness begins with the weights of readings without misfit.
@@ -164,7 +164,7 @@ def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diff
     return _fit(samples, normal, shape, None, None, GIVEN_F0, np.full(4, f0), anew=True)
 
 
-def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions | None, table: wp.array | None, freedom: int,
+def _fit(samples: Samples, normal: np.ndarray, shape: LobeShape, options: SearchOptions | None, table: wp.array | None, freedom: int,
          given: np.ndarray | None = None, *, anew: bool = False) -> Material:
     if table is not None and table.shape[1:] != (samples.light_count, COLUMNS):
         raise ArrayError(f"table is {table.shape}, the samples have {samples.light_count} lights: give their response table")
@@ -183,7 +183,7 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
 
 
 def _fit_metallic(samples: Samples, normal: np.ndarray, own: Material, tinted: Material, tried: np.ndarray, f0: float, *,
-                  shape: Diffuse) -> np.ndarray:
+                  shape: LobeShape) -> np.ndarray:
     """Replace the materials in `own` of pixels between dielectric and metal, and return which they are.
 
     Args:

@@ -13,7 +13,7 @@ import numpy as np
 
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, Material, fit_given
 from kernels.photometric.model.samples import Samples, host_vectors, to_host
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 
 LEAST_PIXELS = 16
 """Fewest pixels of a metal whose readings are added up."""
@@ -24,7 +24,7 @@ SURE = 3.0
 
 
 def with_whole_energy(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *,
-                      shape: Diffuse) -> np.ndarray | None:
+                      shape: LobeShape) -> np.ndarray | None:
     """Return shared materials, metals with the energy that their readings have; None: they have it already. Waits for the device.
 
     Args:

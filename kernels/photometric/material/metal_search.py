@@ -16,7 +16,7 @@ from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, COST_FLO
 from kernels.photometric.model.candidates import LEAST_NZ, rings
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, to_host
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 
 WIDE = ((4.0, 9.0, 15.0), 12)
 """Radii of the rings about the normal found so far, degrees, and the number of candidates on the last of them; under each metal."""
@@ -52,7 +52,7 @@ def metals_of(shared: np.ndarray, single: Material) -> Metals:
     return Metals(lobes, float(np.percentile(costs, EXPLAINED)) if len(costs) else 0.0)
 
 
-def search_metals(samples: Samples, normal: np.ndarray, material: Material, metals: Metals, *, shape: Diffuse) -> np.ndarray:
+def search_metals(samples: Samples, normal: np.ndarray, material: Material, metals: Metals, *, shape: LobeShape) -> np.ndarray:
     """Return the normals, [n, 3] float32, with those of metals replaced that a shared metal explains at less than half of the cost.
 
     `material` is what the given normals make of each pixel.

@@ -25,7 +25,7 @@ from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.lobes import RESPONSES, Reflectance, direction_reflectance
 from kernels.photometric.model.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
-from kernels.photometric.search.hypotheses import Diffuse, criteria
+from kernels.photometric.search.hypotheses import LobeShape, criteria
 
 MIXED_ROWS = 6
 """Values that scratch memory holds for each light beside the reflectance and the weights: in each channel, what the lobe of the second
@@ -182,7 +182,7 @@ class _Mixed(NamedTuple):
     cost: np.ndarray  # [n] per light
 
 
-def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: Diffuse) -> np.ndarray:
+def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: LobeShape) -> np.ndarray:
     """Choose the pairs of shared materials that pixels mix; waits for the device.
 
     Args:
@@ -206,7 +206,8 @@ def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, si
     return pairs[chosen]
 
 
-def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *, shape: Diffuse) -> tuple[Material, Mixture]:
+def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *,
+                  shape: LobeShape) -> tuple[Material, Mixture]:
     """Replace the material of pixels that two materials, of [pairs, 2, 4], explain clearly better than one; waits for the device.
 
     Mixed pixels get the albedo of both together, and F0 and roughness of single_lobe.
@@ -247,7 +248,7 @@ def _better(fit: _Mixed, single_cost: np.ndarray) -> np.ndarray:
     return inside & (MIXED_RISE * fit.cost + COST_FLOOR < single_cost)
 
 
-def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse) -> _Mixed:
+def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: LobeShape) -> _Mixed:
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     fitted = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
     scratch = scratch_memory(samples, HELD)

@@ -16,7 +16,7 @@ import numpy as np
 from kernels.photometric.material.material import MATT, Material, fit_given, fit_material, is_dielectric
 from kernels.photometric.material.material_kernel import ROUGHNESS_FIRST
 from kernels.photometric.model.samples import Samples, evenly
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 
 CANDIDATES = 100
 """Number of pixels whose materials are candidates."""
@@ -37,7 +37,7 @@ F0_GRID, F0_HALVINGS = 5, 4
 times that their step is halved about the best: three per cent from one to the next where the F0 differ by a factor of six."""
 
 
-def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+def choose_materials(samples: Samples, normal: np.ndarray, *, shape: LobeShape) -> np.ndarray:
     """Return [materials, 4] float32: F0 and roughness of the materials that sampled pixels share, in the order in which they were chosen.
 
     Waits for the device. The samples are some hundreds of pixels, spread over the object.
@@ -62,7 +62,7 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
 
 
 def _settle_roughness(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *,
-                      shape: Diffuse) -> tuple[np.ndarray, np.ndarray]:
+                      shape: LobeShape) -> tuple[np.ndarray, np.ndarray]:
     """Return the materials, [materials, 4], with the roughness at which the total cost beside the others is least, and their costs,
     [materials, n]."""
     materials, costs = materials.copy(), costs.copy()
@@ -78,7 +78,7 @@ def _settle_roughness(samples: Samples, normal: np.ndarray, materials: np.ndarra
     return materials, costs
 
 
-def best_dielectric(samples: Samples, normal: np.ndarray, shared: np.ndarray | None, *, shape: Diffuse) -> Material:
+def best_dielectric(samples: Samples, normal: np.ndarray, shared: np.ndarray | None, *, shape: LobeShape) -> Material:
     """Return the dielectric among the shared materials, [materials, 4], that explains each sampled pixel best, or a matt one if none is
     among them; waits for the device."""
     known = np.zeros((0, 4)) if shared is None else shared[is_dielectric(shared)]
@@ -87,7 +87,7 @@ def best_dielectric(samples: Samples, normal: np.ndarray, shared: np.ndarray | N
     return Material(*(np.stack(planes)[best, np.arange(len(best))] for planes in zip(*fits, strict=True)))
 
 
-def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: LobeShape) -> np.ndarray:
     """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough; `costs` is [materials, n]."""
     dielectric = is_dielectric(materials)
     dielectric[0] &= (materials[0] != MATT).any()  # which came first because the object is matt

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels.device import once
-from kernels.microfacet import INVERSE_PI, diffuse, ggx_seen, masking_root, schlick
+from kernels.microfacet import INVERSE_PI, diffuse, ggx_seen, masking_root, schlick, short_tails
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.samples import samples_type, scratch_type
 
@@ -80,7 +80,7 @@ def direction_lobes(lanes: int) -> Lobes:
             scratch.values[at + wp.static(MIXTURE + 1) * scratch.step] = rise
 
     @wp.func
-    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
+    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
              scratch: scratch_struct):
         vx, vy, vz = vector_at(samples.view, p)
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
@@ -108,6 +108,10 @@ def direction_lobes(lanes: int) -> Lobes:
                 width = alphas[a]
                 for k in range(lanes):
                     lobe[k] = fresnel[k] * ggx_seen(nl[k], nv[k], nh[k], width, view_root[a, k])
+                if form[2] > 0.0:
+                    for k in range(lanes):
+                        factor, _ = short_tails(nh[k], width)
+                        lobe[k] = lobe[k] * factor
                 scratch.values[at + (1 + a) * scratch.step] = lobe
 
     return Lobes(MIXTURE, MIXTURE + GEOMETRY, 1.0, prepare, fill)
@@ -119,7 +123,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
 
     @wp.func
-    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type,
+    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type,
                 p: int, scratch: scratch_struct):
         vx, vy, vz = vector_at(samples.view, p)
         nv = lane_type()
@@ -164,7 +168,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
             scratch.values[at + 2 * scratch.step] = rise
 
     @wp.func
-    def lambertian(samples: samples_struct, form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
+    def lambertian(samples: samples_struct, form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
         vx, vy, vz = vector_at(samples.view, p)
         above, below, share = lane_type(), lane_type(), lane_type()
         for light in range(samples.light_count):

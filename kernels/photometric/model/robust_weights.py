@@ -24,11 +24,11 @@ ROOT_OF_THIRD = 3.0**-0.5
 
 @wp.struct
 class Criteria:
-    """Noise, shadows and diffuse lobe by which a fit judges readings; `hypotheses.criteria` makes them."""
+    """Noise, shadows and shape of lobes by which a fit judges readings; `hypotheses.criteria` makes them."""
 
     noise: wp.vec2  # s0, s1
     shadow: wp.vec2  # r²/σ² of equal cost, depth
-    form: wp.vec2  # diffuse roughness, slope
+    form: wp.vec3  # diffuse roughness, slope, 1.0 for short tails
 
 
 @wp.func

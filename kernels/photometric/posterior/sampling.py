@@ -24,7 +24,7 @@ from kernels.photometric.model.response_table import POSTERIOR_WIDTHS, SEARCH_WI
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.posterior.modes import Modes, find_modes, weigh
 from kernels.photometric.posterior.posterior import Group, bounded, measure_noise, normal_posterior
-from kernels.photometric.search.hypotheses import Diffuse, RingOptions, search_normals
+from kernels.photometric.search.hypotheses import LobeShape, RingOptions, search_normals
 from kernels.photometric.search.search_kernel import SAMPLING_SWEEPS
 
 DIELECTRIC, METAL = 0.04, 0.8
@@ -103,7 +103,7 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
     """Find the normal and the material of sampled pixels that explain their readings best; waits for the device.
     `samples`: their readings, radiance over the irradiance of each light. `view`: [n, 3] unit directions to the viewer. `start`: [n, 3]
     unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere."""
-    lambert = Diffuse()
+    lambert = LobeShape()
     first, other = find_modes(samples, bounded(tables.search[0], samples), view) if start is None else (start, start)
     near = search_normals(samples, first, shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
                           table=tables.search[0]).normal
@@ -118,7 +118,7 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
 
 def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None) -> SamplingFit:
     """Estimate normal, material and regime of sampled pixels; `found` is what search_sampling found for them, if it was asked."""
-    lambert = Diffuse()
+    lambert = LobeShape()
     if found is None:
         found = search_sampling(samples, tables, view)
     metallic = found.metallic

@@ -23,7 +23,7 @@ from kernels.packs import pack_type
 from kernels.photometric.model.lobes import MIXTURE
 from kernels.photometric.model.samples import Samples, per_pixel, to_host
 from kernels.photometric.search.descent_kernel import descent_kernel
-from kernels.photometric.search.hypotheses import Diffuse, Prior, SearchOptions, criteria, prior_pull
+from kernels.photometric.search.hypotheses import LobeShape, Prior, SearchOptions, criteria, prior_pull
 
 
 class Schedule(NamedTuple):
@@ -66,7 +66,7 @@ class Descent(NamedTuple):
         return less
 
 
-def descend(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
+def descend(samples: Samples, start: np.ndarray, *, shape: LobeShape, options: SearchOptions | None = None,
             weights: np.ndarray | None = None, prior: Prior | None = None, schedule: Schedule = COLD) -> Descent:
     """Return the normal of least cost near the start of each sampled pixel, under lights of one direction each; waits for the device.
 

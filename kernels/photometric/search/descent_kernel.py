@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.elementary import log_of
-from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
+from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick, short_tails
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.candidates import LEAST_NZ, tangents
 from kernels.photometric.model.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
@@ -204,13 +204,19 @@ def descent_kernel(lanes: int) -> Any:
                     by_l[k] = x[0, k] * on_l
                     by_v[k] = x[0, k] * on_v
                 for a in range(gloss):
+                    fall, on_fall = lane_type(1.0), lane_type()
+                    if criteria.form[2] > 0.0:
+                        for k in range(lanes):
+                            short, on_short = short_tails(nh[k], alphas[a])
+                            fall[k] = short
+                            on_fall[k] = on_short
                     for k in range(lanes):
                         lobe, on_h, along_l, along_v, _ = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k],
                                                                                      view_slope[a, k])
-                        scaled = fresnel[k] * x[1 + a, k]
-                        f[1 + a, k] = fresnel[k] * lobe
+                        scaled = fresnel[k] * fall[k] * x[1 + a, k]
+                        f[1 + a, k] = fresnel[k] * fall[k] * lobe
                         predicted[k] += scaled * lobe
-                        by_h[k] += scaled * on_h
+                        by_h[k] += scaled * on_h + fresnel[k] * on_fall[k] * x[1 + a, k] * lobe
                         by_l[k] += scaled * along_l
                         by_v[k] += scaled * along_v
                 for k in range(lanes):

@@ -31,13 +31,15 @@ from kernels.photometric.search.search_kernel import REWEIGHTINGS, SWEEPS, searc
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diffuse:
-    """Shape of the diffuse lobe, shared by the pixels of a material."""
+class LobeShape:
+    """Shape of the lobes, shared by the pixels of a material."""
 
     rough: float = -1.0
-    """Roughness of Burley's lobe, 0…1; a value below 0 selects Lambert's lobe."""
+    """Roughness of Burley's diffuse lobe, 0…1; a value below 0 selects Lambert's lobe."""
     slope: float = 0.0
     """Slope s of a further factor 1 + s · (1 - n·l)."""
+    short_tails: bool = False
+    """Whether highlights fall off nearly as Beckmann's, and not as those of GGX; see microfacet.short_tails."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +76,13 @@ class RingOptions(SearchOptions):
                    shadow_depth=options.shadow_depth, reweightings=reweightings)
 
 
-def criteria(options: SearchOptions | None, shape: Diffuse) -> Criteria:
+def criteria(options: SearchOptions | None, shape: LobeShape) -> Criteria:
     """Return what kernels judge readings by; without options, the defaults."""
     options = options or SearchOptions()
     found = Criteria()
     found.noise = wp.vec2(options.noise_floor, options.noise_slope)
     found.shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
-    found.form = wp.vec2(shape.rough, shape.slope)
+    found.form = wp.vec3(shape.rough, shape.slope, float(shape.short_tails))
     return found
 
 
@@ -111,7 +113,7 @@ class Search(NamedTuple):
     survey: wp.array  # [candidates, packs] float packs, on the device: cost of each candidate of the first rings, summed over the lights
 
 
-def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
+def search_normals(samples: Samples, start: np.ndarray, *, shape: LobeShape,
                    wide: tuple[tuple[float, ...], int],
                    fine: tuple[tuple[tuple[float, ...], int], ...] = (), options: RingOptions | None = None,
                    table: wp.array | None = None, prior: Prior | None = None) -> Search:
@@ -152,7 +154,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     return Search(*(to_host(samples, values) for values in (found.normal, found.cost, found.weights)), survey)
 
 
-def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape: LobeShape) -> np.ndarray:
     """Return the readings, [n, lights] float32, that mixtures of lobes predict relative to the level of each pixel; waits for the device.
 
     `weights` is [n, lobes] of the mixtures, from search_normals.

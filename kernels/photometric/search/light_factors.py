@@ -17,7 +17,7 @@ import numpy as np
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, device_values, host_values
 from kernels.photometric.search.descent import COLD, WARM, descend
-from kernels.photometric.search.hypotheses import Diffuse, predict
+from kernels.photometric.search.hypotheses import LobeShape, predict
 from kernels.spread import MAD_TO_SIGMA
 
 TRIAL_ROUNDS, ROUNDS = 2, 12
@@ -58,7 +58,7 @@ class LightFactors(NamedTuple):
 
 
 def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarray, row: np.ndarray, col: np.ndarray, *,
-                       shape: Diffuse) -> LightFactors:
+                       shape: LobeShape) -> LightFactors:
     """Find the factors of the intensities, and whether to believe them.
     `samples`: direct light of some hundreds of pixels, spread over the object. `directions`: [lights, 3] unit, in the camera frame.
     `row, col`: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour."""
@@ -79,7 +79,7 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
     return LightFactors(_factors(samples, start, directions, shape, ROUNDS) if believed else same, gain, believed)
 
 
-def _factors(samples: Samples, start: np.ndarray, directions: np.ndarray, shape: Diffuse, rounds: int) -> np.ndarray:
+def _factors(samples: Samples, start: np.ndarray, directions: np.ndarray, shape: LobeShape, rounds: int) -> np.ndarray:
     """Return [lights] factors after some rounds of search and comparison."""
     logarithm, normal, weights, schedule = np.zeros(len(directions)), start, None, COLD
     for step in range(rounds):

@@ -17,7 +17,7 @@ import numpy as np
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.search.descent import WARM, Descent, descend
-from kernels.photometric.search.hypotheses import Diffuse, Prior, SearchOptions
+from kernels.photometric.search.hypotheses import LobeShape, Prior, SearchOptions
 from kernels.photometric.search.survey import CLOSE, Survey, Sweep, survey
 
 STEPS = ((0, 2), (2, 0), (0, -2), (-2, 0), (3, 3), (-3, 3), (3, -3), (-3, -3))
@@ -49,7 +49,7 @@ def neighbours(pixels: np.ndarray, width: int) -> np.ndarray:
     return found
 
 
-def propagate(samples: Samples, found: Descent, beside: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
+def propagate(samples: Samples, found: Descent, beside: np.ndarray, *, shape: LobeShape, options: SearchOptions | None = None,
               prior: Prior | None = None) -> None:
     """Replace the answers of pixels that a start from a neighbour's answer betters, in place.
 
@@ -74,7 +74,7 @@ class Found(NamedTuple):
     """The survey of the pixels that may have another mode; None: no pixel may."""
 
 
-def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
+def find_normals(samples: Samples, start: np.ndarray, *, shape: LobeShape, options: SearchOptions | None = None,
                  beside: np.ndarray | None = None, prior: Prior | None = None, sweep: Sweep = CLOSE) -> Found:
     """Find the normal of least cost of each sampled pixel, under lights of one direction each; waits for the device.
 

@@ -22,7 +22,7 @@ from kernels.packs import channels_type, pack_type
 from kernels.photometric.model.candidates import LEAST_NZ, tangents
 from kernels.photometric.model.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
-from kernels.photometric.search.hypotheses import Diffuse, criteria
+from kernels.photometric.search.hypotheses import LobeShape, criteria
 
 LINEAR_TURNS = 2
 """Rounds of the robust linear fit before the first step."""
@@ -51,7 +51,7 @@ class Refinement(NamedTuple):
     openness: np.ndarray  # [n] float32, variance of the normal per unit of noise, both tilts together, squared radians
 
 
-def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse) -> Refinement:
+def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: LobeShape) -> Refinement:
     """Refine the normal and material of sampled pixels under lights of one direction each; waits for the device.
 
     The result is the best fit met on the way, never of higher cost than the first.

@@ -13,7 +13,7 @@ import numpy as np
 
 from kernels.photometric.model.samples import Samples, host_values
 from kernels.photometric.search.descent import Descent
-from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
+from kernels.photometric.search.hypotheses import LobeShape, SearchOptions, predict
 from kernels.photometric.search.survey import evidence
 
 UNKNOWN_SHARE = 0.25
@@ -27,7 +27,7 @@ OUTLYING = 2.0
 """Residual, in units of the noise of the cost, beyond which a reading is a shadow or a highlight of its own."""
 
 
-def shared_misfit(samples: Samples, found: Descent, *, shape: Diffuse) -> float:
+def shared_misfit(samples: Samples, found: Descent, *, shape: LobeShape) -> float:
     """Return the share, 0…1, of the squared residuals that both pixels of a pair have in common, in the middle pair of those that are
     explained, times the part of these among all pairs; waits for the device.
     `samples`: the first pixels of all pairs, then the second ones. `found`: their descents under `shape`."""

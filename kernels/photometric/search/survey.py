@@ -17,7 +17,7 @@ from kernels.packs import pack_type
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import Samples, samples_type, to_host
 from kernels.photometric.search.descent import Descent, Schedule, descend
-from kernels.photometric.search.hypotheses import Diffuse, Prior, RingOptions, SearchOptions, search_normals
+from kernels.photometric.search.hypotheses import LobeShape, Prior, RingOptions, SearchOptions, search_normals
 from kernels.photometric.search.search_kernel import SURVEY_REWEIGHTINGS
 
 INFORMATIVE = 0.1
@@ -112,7 +112,7 @@ class Survey(NamedTuple):
     """The rings on which the candidates lie, as in `Sweep`."""
 
 
-def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchOptions | None = None,
+def survey(samples: Samples, found: Descent, *, shape: LobeShape, options: SearchOptions | None = None,
            prior: Prior | None = None, sweep: Sweep = CLOSE) -> Survey | None:
     """Survey the pixels that may have another mode, and take over better ones into their descents, in place; waits for the device.
 

@@ -19,10 +19,10 @@ from kernels.packs import pack_type, vector_at
 from kernels.photometric.lambertian.near import NearField, falloff
 from kernels.photometric.material.material import MATT, METAL_DIFFUSE, Material, fit_given
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 
 
-def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, shape: Diffuse) -> np.ndarray:
+def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, shape: LobeShape) -> np.ndarray:
     """Return [n, 3] the part of the light from other surfaces that sampled pixels send on.
 
     Light from many directions hardly asks how wide a lobe is. The albedo beside a lobe of its own does, because a wide tinted lobe and the

@@ -17,8 +17,8 @@ from kernels.photometric.material.metal_search import Metals, metals_of
 from kernels.photometric.material.mixtures import NO_PAIRS, choose_pairs
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.model.samples import Samples, evenly
-from kernels.photometric.search.diffuse_shape import choose_diffuse
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
+from kernels.photometric.search.lobe_shape import choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
 
@@ -28,7 +28,7 @@ STRETCH = 9
 """Most neighbouring pixels of which the one with the smoothest surface is one of these: where normals turn within a pixel, they widen its
 highlight. On the shipped owl, whose feathers turn them by 11° from pixel to pixel, roughness is 0.03 too high without this."""
 LOBE_PIXELS = 384
-"""Most pixels of an object or a part, spread over it, from which the shape of its diffuse lobe is chosen."""
+"""Most pixels of an object or a part, spread over it, from which the shape of its lobes is chosen."""
 LEAST_PIXELS, LEAST_SHARE = 192, 0.01
 """Pixels that face the camera, and share of those of the object, that a part has whose lobe is chosen: fewer do not tell shapes apart."""
 MOST_PARTS = 16
@@ -48,9 +48,9 @@ READ_AT_ONCE = 4096
 class Kind(NamedTuple):
     """What pixels share."""
 
-    shape: Diffuse
-    """The shape of the diffuse lobe under which normals are found."""
-    lobe: Diffuse
+    shape: LobeShape
+    """The shape of the lobes under which normals are found."""
+    lobe: LobeShape
     """The shape under which materials are fitted."""
     materials: np.ndarray | None = None  # [materials, 4] F0 and roughness; None: every pixel has a material of its own
     metals: Metals | None = None
@@ -111,7 +111,7 @@ class Kinds:
         for number in large[np.argsort(-counts[large], kind="stable")][:MOST_PARTS]:
             spread = facing[part[facing] == number]
             spread = spread[evenly(len(spread), LOBE_PIXELS)]
-            found = choose_diffuse(read(spread), normal[:, spread].T, beside=usual)
+            found = choose_lobe_shape(read(spread), normal[:, spread].T, beside=usual)
             if found.tried[found.best] < OWN * found.tried[usual]:
                 self.which[part == number] = len(self.kinds)
                 self.kinds.append(Kind(found.mean, found.best))
@@ -148,9 +148,9 @@ def smoothest(pixels: np.ndarray, normal: np.ndarray, width: int) -> np.ndarray:
     return tried.reshape(-1, stretch)[np.arange(len(alike)), alike.argmax(axis=1)]
 
 
-def lobe_report(lobe: Diffuse) -> dict[str, float | None]:
-    """Return what the report says of a diffuse lobe: its roughness, None for Lambert's, and its slope."""
-    return {"diffuse_roughness": None if lobe.rough < 0 else lobe.rough, "diffuse_slope": lobe.slope}
+def lobe_report(lobe: LobeShape) -> dict[str, float | None]:
+    """Return what the report says of lobes: the diffuse one's roughness, None for Lambert's, its slope, and the tails of highlights."""
+    return {"diffuse_roughness": None if lobe.rough < 0 else lobe.rough, "diffuse_slope": lobe.slope, "short_tails": lobe.short_tails}
 
 
 def material_report(materials: np.ndarray) -> list[dict[str, object]]:

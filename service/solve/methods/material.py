@@ -24,9 +24,9 @@ from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.descent import descend
-from kernels.photometric.search.diffuse_shape import choose_diffuse
-from kernels.photometric.search.hypotheses import Diffuse, Prior
+from kernels.photometric.search.hypotheses import LobeShape, Prior
 from kernels.photometric.search.light_factors import find_light_factors
+from kernels.photometric.search.lobe_shape import choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals, neighbours
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfit
 from kernels.photometric.search.survey import QUICK
@@ -119,7 +119,7 @@ class _Walk:
         self._robust = self.result.normal
         self._unknown_bounce: np.ndarray | float = 0.0  # degrees, [pixels], by which an unknown strength of that light turns normals
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._lobe, self._supported, self._pull, self._simpler = Diffuse(), Diffuse(), True, 0.0, Method.LAMBERT
+        self._shape, self._lobe, self._supported, self._pull, self._simpler = LobeShape(), LobeShape(), True, 0.0, Method.LAMBERT
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -151,7 +151,7 @@ class _Walk:
         self._bouncing[:, solved] = before.albedo[:, solved]
 
     def choose_shape(self, light: DirectLight | None = None) -> None:
-        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all."""
+        """Choose the shape of the lobes, and find out whether few lights support the lobes at all."""
         self._given.timings.stage("shape", 1)
         if not len(self._spread):
             return
@@ -163,7 +163,7 @@ class _Walk:
             self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
         samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._supported:
-            shapes = choose_diffuse(samples, normal)
+            shapes = choose_lobe_shape(samples, normal)
             self._shape, self._lobe = shapes.mean, shapes.best
             self.result.facts |= {**lobe_report(self._lobe), "shapes_tried": len(shapes.tried)}
 
@@ -224,7 +224,7 @@ class _Walk:
         return light.under(self._lights, found.factor)
 
     def choose_kinds(self, light: DirectLight | None) -> Kinds:
-        """Return the diffuse lobes and the materials that pixels share, without materials where they share none."""
+        """Return the shapes of lobes and the materials that pixels share, without materials where they share none."""
         kinds = Kinds(Kind(self._shape, self._lobe), self._given.stack.pixel_count)
         if light is None or not (self._options.sharing and self._supported):
             return kinds

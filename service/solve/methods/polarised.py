@@ -18,7 +18,7 @@ from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.mixtures import HELD
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.model.misfit import LARGEST_ERROR
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.status import ESTIMATED
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
@@ -143,7 +143,7 @@ def _fit_lobes(given: SolveInput, lights: Lights, field: NearField | None, solut
     model = DiffuseModel(lights, field, solution.normal, solution.albedo)
     stack = OnDiffuseModel.of(given.pairs.specular, given.stack, model)
     here, lit = replace(given, stack=stack), lights._replace(scale=stack.scale)
-    view, shape = view_directions(given.camera), Diffuse()
+    view, shape = view_directions(given.camera), LobeShape()
     spread = smoothest(pixels, solution.normal, given.camera.width)
     samples = pick_pixels(here, lit, view, spread, field)
     materials = choose_materials(samples, solution.normal[:, spread].T, shape=shape)

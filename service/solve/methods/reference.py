@@ -21,7 +21,7 @@ from kernels.photometric.model.samples import Samples
 from kernels.photometric.posterior.modes import GRID_FLOATS, find_modes, weigh
 from kernels.photometric.posterior.posterior import Group, bounded, measure_noise, normal_posterior
 from kernels.photometric.posterior.sampling import AROUND, AROUND_OPTIONS, FINE, OPTIONS
-from kernels.photometric.search.hypotheses import Diffuse, search_normals
+from kernels.photometric.search.hypotheses import LobeShape, search_normals
 from kernels.status import Status
 from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, readable, view_directions
@@ -47,9 +47,9 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
     viewer."""
     model = bounded(table, samples)
     starts = find_modes(samples, model, view)
-    near = [search_normals(samples, start, shape=Diffuse(), options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:], table=table).normal
+    near = [search_normals(samples, start, shape=LobeShape(), options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:], table=table).normal
             for start in starts]
-    found = search_normals(samples, near[0], shape=Diffuse(), options=OPTIONS, wide=FINE[0], fine=FINE[1:], table=table)
+    found = search_normals(samples, near[0], shape=LobeShape(), options=OPTIONS, wide=FINE[0], fine=FINE[1:], table=table)
     first = Group(samples, model, found.normal)
     noise = measure_noise([first])
     modes = weigh(normal_posterior(first, noise), normal_posterior(first._replace(normal=near[1]), noise))

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from kernels.device import to_numpy
 from kernels.photometric.model.samples import Samples, readings_of
 from kernels.photometric.search.descent import Descent, descend
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.interreflection import arriving_light
@@ -98,7 +98,7 @@ def _middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Mi
     return Middles(solved, block, pixels, readings_of(pick(pixels)))
 
 
-def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
+def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
     """Find the light that an object throws on itself from the surface without it.
     `light`: of a first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
     positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
@@ -111,7 +111,7 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     return _in_rounds(light, normal, shape, pick, within, relative=relative)._replace(shown=shown)
 
 
-def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples]
+def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]
               ) -> tuple[Samples, Descent]:
     """Return the readings of some pixels in direct light, and their descents from `start` [n, 3]."""
     samples = pick(pixels)
@@ -119,7 +119,7 @@ def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: 
     return samples, descend(samples, start, shape=shape)
 
 
-def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples],
+def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples],
                        within: Middles) -> bool:
     """Return whether lit readings leave it possible that light has bounced; parameters as of `settle`."""
     start = normal[:, within.pixels].T
@@ -128,7 +128,7 @@ def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: Diffuse, p
     return whole >= min(BETTER * direct, direct - LEAST_GAIN)
 
 
-def _in_rounds(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], within: Middles, *,
+def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], within: Middles, *,
                relative: bool) -> Settled:
     """Return the light after the rounds; parameters as of `settle`."""
     assert light.arriving is not None

@@ -21,7 +21,7 @@ from kernels.photometric.lambertian.robust import (
     SHADOW_FRACTION,
 )
 from kernels.photometric.model.samples import Samples, device_values, host_values, host_vectors
-from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
+from kernels.photometric.search.hypotheses import LobeShape, SearchOptions, predict
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
 from service.requests.solve import Method
@@ -64,8 +64,8 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
         out = np.arange(lights) % parts == part
         kept = np.where(out, -1.0, readings)
         rest = samples._replace(grey=device_values(samples, kept))
-        found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
-        predicted[0][:, out] = np.maximum(predict(samples, found.normal, found.weights, shape=Diffuse())[:, out], 0)
+        found = find_normals(rest, start, shape=LobeShape(), sweep=QUICK).best
+        predicted[0][:, out] = np.maximum(predict(samples, found.normal, found.weights, shape=LobeShape())[:, out], 0)
         for model, method in enumerate((Method.LAMBERT, Method.ROBUST), start=1):
             predicted[model][:, out] = np.maximum(np.einsum("nlc,nc->nl", toward[:, out], _simple_fit(kept, toward, method)), 0)
     given = readings >= 0

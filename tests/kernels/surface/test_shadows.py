@@ -10,7 +10,7 @@ from kernels.errors import ArrayError
 from kernels.photometric.lambertian.near import NearField, pad_places
 from kernels.photometric.material.material import fit_tinted
 from kernels.photometric.model.samples import readings_of, to_host
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.shadows.bounce import bounce_albedo, subtract_bounce
 from kernels.photometric.shadows.shadowing import exclude_shadows
 from kernels.surface.interreflection import gather_light
@@ -270,14 +270,14 @@ def test_bounced_light_is_that_of_the_whole_reflection(device):
     colour = np.array([0.6, 0.5, 0.4])
     soft = 0.04 * colour[:, None, None] * (1 + LIGHTS[None, :, None, 0])  # as a wall beside it sends
     samples, _ = sample(render(normal, albedo=colour, alpha=0.1) + soft, device)
-    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
-    found = bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse())
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=LobeShape())
+    found = bounce_albedo(samples, normal.astype(np.float32), tinted, shape=LobeShape())
     wrong, alone = (np.quantile(np.abs(np.log(np.maximum(albedo, 1e-3) / colour)), 0.9) for albedo in (found, tinted.diffuse_albedo))
     assert wrong < 0.3  # the added light is 10 to 20 % of the diffuse
     assert alone > 0.3
     samples, _ = sample(render(normal, albedo=np.zeros(3), alpha=0.16, f0=0.8), device)
-    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
-    assert bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse()).max() < 0.05
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=LobeShape())
+    assert bounce_albedo(samples, normal.astype(np.float32), tinted, shape=LobeShape()).max() < 0.05
 
 
 def test_near_light_is_taken_off_in_the_unit_of_each_reading(device):

@@ -4,13 +4,13 @@ import numpy as np
 
 from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.metal_energy import LEAST_PIXELS, with_whole_energy
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.material.test_mixtures import GOLD, metal
 from tests.kernels.photometric.test_svbrdf import sample, tilted
 from tests.marks import first_short
 from tests.scenes.glossy import sphere_directions
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 ROUGHNESS = 0.28
 PAINT = [0.04, 0.04, 0.04, 0.4]
 

@@ -4,11 +4,11 @@ import numpy as np
 
 from kernels.photometric.material.material import Material, fit_material
 from kernels.photometric.material.metal_search import Metals, metals_of, search_metals
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.material.test_mixtures import GOLD, LIGHTS, metal
 from tests.kernels.photometric.test_svbrdf import degrees, render, sample, tilted
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 LOBE = np.array([[*GOLD, 0.3]], dtype=np.float32)
 METALS = Metals(LOBE, 0.0)
 

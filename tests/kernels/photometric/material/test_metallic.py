@@ -5,11 +5,11 @@ import warp as wp
 
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, fit_material
 from kernels.photometric.material.material_kernel import metallic_base, metalness
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
 from tests.kernels.scenes import cap
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 LIGHTS = cap(96, 80.0)
 COUNT = 60
 F0 = 0.04

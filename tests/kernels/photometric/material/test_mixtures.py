@@ -6,11 +6,11 @@ import pytest
 from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.mixtures import LEAST_SHARE, NO_PAIRS, choose_pairs, mix_materials, single_lobe
 from kernels.photometric.material.shared_materials import choose_materials
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import COLOUR, render, sample, tilted
 from tests.kernels.scenes import cap
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 GOLD = (0.95, 0.68, 0.35)
 PAINT = 0.04
 LIGHTS = cap(96, 80.0)

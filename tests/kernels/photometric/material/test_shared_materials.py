@@ -5,12 +5,12 @@ import pytest
 
 from kernels.photometric.material.material import COST_FLOOR, FAR_F0, SHARED_RISE, Material, fit_given, fit_material
 from kernels.photometric.material.shared_materials import LEAST_GAIN, MOST, choose_materials
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.svbrdf import RINGS, doubt_of_f0
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
 from tests.kernels.scenes import cap
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 
 
 def test_highlights_of_a_dielectric_have_one_f0(device):
@@ -179,7 +179,7 @@ def material(f0: float, cost: float) -> Material:
 def test_a_tilt_that_passes_for_an_f0_is_doubt(device):
     """With the shared F0 the true normal is found again, a degree away; tolerance: the radius of the last two rings."""
     samples, _ = sample(render(NORMAL, alpha=0.25, f0=0.04), device)
-    doubt = doubt_of_f0(samples, TURNED.astype(np.float32), material(0.12, 0.01), SHARED, shape=Diffuse())
+    doubt = doubt_of_f0(samples, TURNED.astype(np.float32), material(0.12, 0.01), SHARED, shape=LobeShape())
     assert degrees(NORMAL, TURNED).min() > 0.8
     np.testing.assert_allclose(doubt, degrees(NORMAL, TURNED), atol=RINGS[-1] + RINGS[-2])
 
@@ -187,8 +187,8 @@ def test_a_tilt_that_passes_for_an_f0_is_doubt(device):
 def test_what_a_shared_f0_does_not_explain_is_no_doubt(device):
     """A dielectric that is bright shows it, and one that is not far above the shared F0 is not looked at."""
     samples, _ = sample(render(NORMAL, alpha=0.25, f0=0.15), device)
-    np.testing.assert_array_equal(doubt_of_f0(samples, NORMAL, material(0.15, 0.001), SHARED, shape=Diffuse()), 0)
+    np.testing.assert_array_equal(doubt_of_f0(samples, NORMAL, material(0.15, 0.001), SHARED, shape=LobeShape()), 0)
     samples, _ = sample(render(NORMAL, alpha=0.25, f0=0.04), device)
     for f0 in (0.07, 0.5):  # of a dielectric that is not far above, and of a metal
-        np.testing.assert_array_equal(doubt_of_f0(samples, TURNED, material(f0, 0.01), SHARED, shape=Diffuse()), 0)
-    np.testing.assert_array_equal(doubt_of_f0(samples, TURNED, material(0.12, 0.01), SHARED[1:], shape=Diffuse()), 0)
+        np.testing.assert_array_equal(doubt_of_f0(samples, TURNED, material(f0, 0.01), SHARED, shape=LobeShape()), 0)
+    np.testing.assert_array_equal(doubt_of_f0(samples, TURNED, material(0.12, 0.01), SHARED[1:], shape=LobeShape()), 0)

@@ -9,7 +9,7 @@ import warp as wp
 from kernels.errors import ArrayError
 from kernels.photometric.material.material import fit_material
 from kernels.photometric.posterior.sampling import OPTIONS, Regime, SamplingFit, sampling_tables, solve_sampling
-from kernels.photometric.search.hypotheses import Diffuse, search_normals
+from kernels.photometric.search.hypotheses import LobeShape, search_normals
 from tests.kernels.photometric.sources import CENTRES, SHARPNESS, VIEW, readings_of, sphere, table_of
 from tests.kernels.scenes import angle_degrees
 from tests.reference import sampling as twin
@@ -109,7 +109,7 @@ def test_the_rings_find_the_diffuse_lobe_whatever_the_start(device, tables):
     """The search with a table takes the place of lights: those of the samples are not looked at."""
     solve(LAMBERT[:3], device, tables)
     samples = readings_of(0.5 * LAMBERT, device)
-    found = search_normals(samples, np.broadcast_to(VIEW, NORMALS.shape), shape=Diffuse(),
+    found = search_normals(samples, np.broadcast_to(VIEW, NORMALS.shape), shape=LobeShape(),
                            options=replace(OPTIONS, noise_slope=0.3), wide=(tuple(float(d) for d in range(7, 90, 7)), 52),
                            fine=(((2.0, 4.0), 12), ((1.0,), 6)),
                            table=tables[device].search[0])
@@ -122,7 +122,7 @@ def test_the_rings_find_the_diffuse_lobe_whatever_the_start(device, tables):
 def test_roughness_between_the_widths_of_the_table(device, tables, alpha):
     solve(LAMBERT[:3], device, tables)
     near = NORMALS[:, 2] > 0.5
-    material = fit_material(readings_of(ggx(alpha, 0.6)[near], device), NORMALS[near], shape=Diffuse(), options=OPTIONS,
+    material = fit_material(readings_of(ggx(alpha, 0.6)[near], device), NORMALS[near], shape=LobeShape(), options=OPTIONS,
                             table=tables[device].responses)
     assert np.median(material.specular) == pytest.approx(0.6, abs=0.02)
     assert np.median(material.roughness) == pytest.approx(alpha**0.5, abs=0.06 if alpha < 0.1 else 0.02)
@@ -134,9 +134,9 @@ def test_a_table_of_other_lights_is_refused(device, tables):
     for table in (tables[device].search[0], tables[device].responses):
         fewer = wp.array(table.numpy()[:, 1:], dtype=float, device=device)
         with pytest.raises(ArrayError, match="lights"):
-            search_normals(samples, NORMALS[:3], shape=Diffuse(), wide=((), 1), table=fewer)
+            search_normals(samples, NORMALS[:3], shape=LobeShape(), wide=((), 1), table=fewer)
         with pytest.raises(ArrayError, match="lights"):
-            fit_material(samples, NORMALS[:3], shape=Diffuse(), table=fewer)
+            fit_material(samples, NORMALS[:3], shape=LobeShape(), table=fewer)
 
 
 def test_dark_and_missing_readings_do_no_harm(device, tables):

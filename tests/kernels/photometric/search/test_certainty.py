@@ -6,7 +6,7 @@ import pytest
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.search.certainty import ring_areas
 from kernels.photometric.search.descent import descend
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfit
 from kernels.photometric.search.survey import CLOSE
 from kernels.photometric.svbrdf import solve_svbrdf
@@ -40,7 +40,7 @@ def test_a_metal_under_few_lights_is_not_quietly_wrong(device, count):
     lights = cap(count, 75.0)
     normal = tilted(300, 60.0)
     radiance = noisy(render(normal, albedo=np.zeros(3), alpha=0.2, f0=0.8, lights=lights))
-    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.4, -0.4, 0]), shape=Diffuse())
+    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.4, -0.4, 0]), shape=LobeShape())
     error = degrees(fit.normal, normal)
     assert (error > 10).mean() > 0.01  # the task is hard enough to be wrong at
     assert ((error > 10) & (fit.sigma < 1)).mean() < 0.005
@@ -52,7 +52,7 @@ def test_three_lights_are_never_sure(device):
     lights = twin.unit(np.array([[0.6, 0.0, 0.8], [-0.4, 0.5, 0.8], [-0.3, -0.6, 0.75]]))
     normal = tilted(200, 35.0)
     radiance = noisy(render(normal, albedo=0.5 * COLOUR, alpha=0.2, f0=0.06, lights=lights))
-    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.1, 0.05, 0]), shape=Diffuse())
+    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.1, 0.05, 0]), shape=LobeShape())
     assert np.percentile(fit.sigma, 5) > 2.3
 
 
@@ -62,7 +62,7 @@ def test_many_lights_are_as_sure_as_they_are_right(device):
     rng = np.random.default_rng(3)
     radiance = render(normal, alpha=0.2)
     radiance = np.maximum(radiance * (1 + 0.03 * rng.normal(size=radiance.shape)), 0)
-    fit = solve_svbrdf(sample(radiance, device)[0], twin.unit(normal + [0.03, 0, 0]), shape=Diffuse(), shared_misfit=0.0)
+    fit = solve_svbrdf(sample(radiance, device)[0], twin.unit(normal + [0.03, 0, 0]), shape=LobeShape(), shared_misfit=0.0)
     error = degrees(fit.normal, normal)
     assert 0.4 < np.median(error / fit.sigma) < 1.4
     assert (error > 5 * fit.sigma).mean() < 0.01
@@ -79,10 +79,10 @@ def test_neighbours_share_misfit_and_no_noise(device):
         both = common * rng.normal(size=clean.shape)
         pairs = np.concatenate([clean * (1 + both + own * rng.normal(size=clean.shape)) for _ in range(2)], axis=2)
         samples = sample(pairs, device)[0]
-        return shared_misfit(samples, descend(samples, np.tile(normal, (2, 1)), shape=Diffuse()), shape=Diffuse())
+        return shared_misfit(samples, descend(samples, np.tile(normal, (2, 1)), shape=LobeShape()), shape=LobeShape())
 
     assert share(0.0, 0.05) < 0.1
     assert share(0.05, 0.0) > 0.9
     assert 0.3 < share(0.035, 0.035) < 0.7  # 5 % together, so that both pixels count as explained
     none = sample(clean[..., :1], device)[0]
-    assert shared_misfit(none, descend(none, normal[:1], shape=Diffuse()), shape=Diffuse()) == UNKNOWN_SHARE
+    assert shared_misfit(none, descend(none, normal[:1], shape=LobeShape()), shape=LobeShape()) == UNKNOWN_SHARE

@@ -5,14 +5,14 @@ import pytest
 import warp as wp
 
 from kernels.photometric.material.material import fit_tinted
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.search.light_factors import find_light_factors
 from kernels.photometric.search.refine import OPEN, refine, tilt_variance
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import LIGHTS, VIEW, degrees, render, sample, tilted
 from tests.reference import microfacet as twin
 
-LAMBERT = Diffuse()
+LAMBERT = LobeShape()
 GOLD = (0.9, 0.7, 0.3)
 
 
@@ -42,7 +42,7 @@ def test_metals_come_back(device, roughness):
 def test_dielectrics_come_back(device, rough, slope):
     """Albedo, F0 and the diffuse shape beside the lobe; tolerance as above, the lobe being faint."""
     normal = tilted(50, 45.0)
-    shape = Diffuse(rough=-1.0 if rough is None else rough, slope=slope)
+    shape = LobeShape(rough=-1.0 if rough is None else rough, slope=slope)
     samples, _ = sample(render(normal, alpha=0.2, f0=0.05, rough=rough, slope=slope), device)
     found = refine(samples, disturbed(normal, 1.0), np.full(50, 0.5), shape=shape)
     assert np.median(degrees(found.normal, normal)) < 0.05
@@ -85,7 +85,7 @@ ROW, COL = (np.floor((part + 1) * 4).astype(int) for part in NORMAL.T[:2])
 
 def found(radiance, device):
     samples, _ = sample(radiance, device)
-    return find_light_factors(samples, twin.unit(NORMAL + [0.02, -0.01, 0]), LIGHTS, ROW, COL, shape=Diffuse())
+    return find_light_factors(samples, twin.unit(NORMAL + [0.02, -0.01, 0]), LIGHTS, ROW, COL, shape=LobeShape())
 
 
 def jitter(size: float) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_right_intensities_stay(device, surface):
 def test_half_an_object_cannot_be_left_out(device):
     """All pixels lie in one square, so that none are left to ask."""
     samples, _ = sample(render(NORMAL, f0=None) * jitter(0.1)[:, None], device)
-    assert not find_light_factors(samples, NORMAL, LIGHTS, 0 * ROW, 0 * COL, shape=Diffuse()).believed
+    assert not find_light_factors(samples, NORMAL, LIGHTS, 0 * ROW, 0 * COL, shape=LobeShape()).believed
 
 
 def test_a_curvature_that_is_not_positive_leaves_the_normal_open(device):

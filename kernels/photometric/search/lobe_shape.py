@@ -1,10 +1,11 @@
-"""The shape of the diffuse lobe that the pixels of an object share, chosen by how well the object is explained as a whole.
+"""The shape of the lobes that the pixels of an object share, chosen by how well the object is explained as a whole.
 
 Real diffuse reflection is darker than Lambert's at grazing angles on smooth plastics and brighter on rough ceramics. A pixel alone
 cannot tell that shape from a tilt of its normal; all pixels together can: the shape with the least total cost of the
-hypothesis search is also the one with the least error of the normals (docs/figures.md).
+hypothesis search is also the one with the least error of the normals (docs/figures.md). So do they tell whether highlights have the long
+tails of GGX or hardly any, as Beckmann's: no sum of lobes with tails is one without.
 
-Source: the lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3; choosing its shape by cost is ours.
+Source: the diffuse lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3; choosing its shape by cost is ours.
 """
 
 import itertools
@@ -14,7 +15,7 @@ import numpy as np
 
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.search.descent import Schedule, descend
-from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
 
@@ -28,40 +29,48 @@ FROM_LAMBERT = Schedule(softened=0, judged=7)
 """Descent from the normal and weights found under Lambert's lobe: another shape moves normals by a few degrees."""
 SIMPLER = 1.01
 """Factor on the least cost up to which Lambert's lobe, with a slope or without, is kept."""
+SHORT = 0.8
+"""Part of the cost under GGX's lobes to which short tails must lower it: real objects cost .95 to 1.02 of it, path-traced ones under GGX
+.87 and more, and under Beckmann's distribution .3 to .8."""
 TEMPERATURE = 0.07
 """Softmax temperature of the average over shapes, relative to the least cost. Costs a few per cent apart do not tell shapes apart: with the
 shape of least cost alone, the normals of a real ball are 0.07 degrees worse."""
 
 
 class Shapes(NamedTuple):
-    """The shape of the diffuse lobe of an object."""
+    """The shape of the lobes of an object."""
 
-    best: Diffuse
+    best: LobeShape
     """The shape of least cost, under which materials are fitted."""
-    mean: Diffuse
+    mean: LobeShape
     """The mean of the shapes that cost little, under which normals are found: a wrong shape bends them, and the mean errs less."""
-    tried: dict[Diffuse, float]
+    tried: dict[LobeShape, float]
     """The mean cost of each shape."""
 
 
-def choose_diffuse(samples: Samples, start: np.ndarray, *, beside: Diffuse | None = None) -> Shapes:
-    """Choose the shape of the diffuse lobe from some hundreds of pixels, spread over the object; waits for the device.
+def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape | None = None) -> Shapes:
+    """Choose the shape of the lobes from some hundreds of pixels, spread over the object; waits for the device.
 
     `start` is [n, 3] unit normals to begin from. `beside` is a further shape that is tried.
     """
-    lambert = find_normals(samples, start, shape=Diffuse(), sweep=QUICK).best
-    tried: dict[Diffuse, float] = {}
+    first = find_normals(samples, start, shape=LobeShape(), sweep=QUICK).best
+
+    def cost_of(shape: LobeShape) -> float:
+        found = descend(samples, first.normal, shape=shape, weights=first.weights, schedule=FROM_LAMBERT)
+        return float(np.mean(found.cost, dtype=np.float64))
+
+    short_tails = cost_of(LobeShape(short_tails=True)) < SHORT * float(np.mean(first.cost, dtype=np.float64))
+    if short_tails:
+        first = find_normals(samples, start, shape=LobeShape(short_tails=True), sweep=QUICK).best
+    tried: dict[LobeShape, float] = {} if beside is None else {beside: cost_of(beside)}
 
     def judge(rough: float, slope: float) -> None:
-        shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
+        shape = LobeShape(rough=round(rough, 4), slope=round(slope, 4), short_tails=short_tails)
         if shape not in tried:
-            found = descend(samples, lambert.normal, shape=shape, weights=lambert.weights, schedule=FROM_LAMBERT)
-            tried[shape] = float(np.mean(found.cost, dtype=np.float64))
+            tried[shape] = cost_of(shape)
 
     for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
         judge(rough, slope)
-    if beside is not None:
-        judge(beside.rough, beside.slope)
     best = _best(tried)
     rough_step, slope_step = ROUGHNESSES[2] - ROUGHNESSES[1], SLOPES[1] - SLOPES[0]
     for across, along in itertools.product((-1, 0, 1), repeat=2):
@@ -71,17 +80,18 @@ def choose_diffuse(samples: Samples, start: np.ndarray, *, beside: Diffuse | Non
     return Shapes(best, _average(tried, best), tried)
 
 
-def _best(tried: dict[Diffuse, float]) -> Diffuse:
+def _best(tried: dict[LobeShape, float]) -> LobeShape:
     """Return the shape of least cost, or the best slope of Lambert's lobe where that costs hardly more."""
     best = min(tried, key=tried.__getitem__)
     lambert = min((shape for shape in tried if shape.rough < 0), key=tried.__getitem__)
     return lambert if tried[lambert] <= SIMPLER * tried[best] else best
 
 
-def _average(tried: dict[Diffuse, float], best: Diffuse) -> Diffuse:
+def _average(tried: dict[LobeShape, float], best: LobeShape) -> LobeShape:
     """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs."""
-    alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items() if (shape.rough < 0) == (best.rough < 0)])
+    alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items()
+                      if (shape.rough < 0, shape.short_tails) == (best.rough < 0, best.short_tails)])
     least = alike[:, 2].min()
     weights = np.exp(-(alike[:, 2] - least) / max(TEMPERATURE * least, 1e-12))
     rough, slope = weights @ alike[:, :2] / weights.sum()
-    return Diffuse(rough=round(float(rough), 4), slope=round(float(slope), 4))
+    return LobeShape(rough=round(float(rough), 4), slope=round(float(slope), 4), short_tails=best.short_tails)
