@@ -45,13 +45,7 @@ from service.calibrate.solvers.mirror_ball import find_spot, nearest_point
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, dark_side, fit_brightness, fit_direction
-from service.light_estimation.semi_calibrated import (
-    Intensities,
-    check_directions,
-    fit_intensities,
-    light_from_elsewhere,
-    uncertainty_of,
-)
+from service.light_estimation.semi_calibrated import Intensities, check_directions, fit_intensities, light_from_elsewhere, uncertainty_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
 from stage.capture.light import DistantLight, PointLight

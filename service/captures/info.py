@@ -13,14 +13,7 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.dark_lights import dark_lights, dark_sentence
 from service.light_estimation.declared_lights import explanation_sentence, facing_sentence
-from service.light_estimation.explanations import (
-    MIN_LIGHTS,
-    PIXELS,
-    Sample,
-    better_explanation,
-    fit_manifest,
-    grey_readings,
-)
+from service.light_estimation.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest, grey_readings
 from service.light_estimation.lambertian import Fit, Suspect, suspects
 from service.light_estimation.light_axes import Grid, axes_sentence
 from service.reporting.progress import Progress, Timings

@@ -9,14 +9,7 @@ from pathlib import Path
 
 from stage.errors import ManifestError
 from stage.importers.camera_options import mask_beside
-from stage.importers.layout import (
-    color_space_of,
-    doubled_lights,
-    image_resolution,
-    read_lines,
-    read_table,
-    write_capture,
-)
+from stage.importers.layout import color_space_of, doubled_lights, image_resolution, read_lines, read_table, write_capture
 
 
 def import_folder(source: Path, destination: Path) -> Path:

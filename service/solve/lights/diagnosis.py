@@ -14,13 +14,7 @@ from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from service.light_estimation.declared_lights import explanation_sentence, sample_of, sampled
-from service.light_estimation.explanations import (
-    Cause,
-    Sample,
-    better_explanation,
-    fit_manifest,
-    grey_readings,
-)
+from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest, grey_readings
 from service.light_estimation.lambertian import SHADOW, degrees_between, median_of, normal_equations
 from service.light_estimation.light_axes import LightAxes
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
