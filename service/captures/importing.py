@@ -27,7 +27,7 @@ from service.requests.imports.patterns import (
 )
 from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
-from stage.capture.manifest import read_manifest, write_manifest
+from stage.capture.manifest import other_sizes, read_manifest, write_manifest
 from stage.errors import ManifestError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
@@ -48,7 +48,8 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
     if more:
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
-    return imported._replace(facts=(*imported.facts, *(("assumed", sentence) for sentence in manifest.assumed)))
+    said = (*manifest.assumed, *other_sizes(manifest))
+    return imported._replace(facts=(*imported.facts, *(("assumed", sentence) for sentence in said)))
 
 
 def _diligent(request: DiligentImport) -> Imported:

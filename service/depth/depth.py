@@ -32,7 +32,6 @@ from stage.colour.radiance import clipping_sentences
 from stage.errors import ManifestError, storage
 from stage.files import write_text
 from stage.formats.ply import POINTS_FILE, write_ply
-from stage.importers.layout import other_sizes
 from stage.patterns.base import UniformPattern
 from stage.results.depth_maps import CALIBRATION_SIGMA, DEPTH_FILE, CoordinateMaps, DepthMaps
 from stage.stack.fingerprint import Fingerprints, digest
@@ -135,8 +134,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
             points_path.unlink(missing_ok=True)  # of an earlier run: there are no points beside this file
     else:
         write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
-    sizes = (sentence for sentence in other_sizes((capture.whole or capture).manifest) if sentence not in capture.doubts)  # of an import
-    solution.warnings += [*sizes, *capture.doubts, *clipping_sentences(capture.clipped)]
+    solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     points = 0 if cloud is None else len(cloud.points)
     counts = solution.counts(mask)
     write_text(report_path, report(

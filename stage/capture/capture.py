@@ -10,7 +10,7 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, Light, OffLight, PointLight
-from stage.capture.manifest import FILE_NAME, LIT_BY, Frame, Manifest, read_manifest
+from stage.capture.manifest import FILE_NAME, LIT_BY, Frame, Manifest, other_sizes, read_manifest
 from stage.colour import radiance as radiances
 from stage.colour.colour_spaces import NAMES, is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
@@ -83,7 +83,7 @@ class Capture:
         headers = capture._check_files()
         capture = capture._exposed(headers)
         capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_encodings(headers),
-                                           *capture._other_pixels(headers), *capture.manifest.assumed))
+                                           *capture._other_pixels(headers), *other_sizes(capture.manifest), *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property

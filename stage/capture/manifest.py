@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from stage.capture.camera import Camera, OtherCamera, StereoImages
 from stage.capture.light import Laser, Light, TimeOfFlight
-from stage.capture.projector import AnyProjector
+from stage.capture.projector import AnyProjector, Projector
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.model import FirstFault, Positive, Strict, Text, Vector
@@ -23,6 +23,10 @@ LIT_BY = ("light", "pattern", "laser", "tof", "stereo")
 """The fields of a frame that say what lit it; every frame has exactly one."""
 FileName = Text
 """The name of a file of the capture, relative to its folder."""
+
+OFF_PART, SAME_PART = 0.2, 0.1
+"""Parts of half a side by which the principal point of a calibration at another size lies off the middle, at least, and by which such a
+part differs between the sides, at most."""
 
 
 ColorMatrix = tuple[Vector, Vector, Vector]
@@ -138,6 +142,23 @@ class Manifest(Strict):
                 if taken.setdefault(posixpath.normpath(image), f"frames[{index}].stereo") != f"frames[{index}].stereo" or \
                         frame.stereo.images.count(image) > 1:
                     yield f"frames[{index}].stereo.images: {image} is already the image of {taken[posixpath.normpath(image)]}"
+
+
+def other_sizes(manifest: Manifest) -> Iterator[str]:
+    """Yield a sentence for each device whose calibration looks like one at another size of images: its principal point lies off the middle
+    by the same part of both sides, which that of a part of an image or of a shifted lens hardly ever does."""
+    devices: list[tuple[str, Camera | Projector | OtherCamera]] = [("camera", manifest.camera)]
+    devices += [("projector", manifest.projector)] if isinstance(manifest.projector, Projector) else []
+    devices += [(f"other_cameras[{index}]", other) for index, other in enumerate(manifest.other_cameras)]
+    for field, device in devices:
+        if device.focal_px is None or device.principal_px is None:
+            continue
+        across, down = (2 * place / side for place, side in zip(device.principal_px, device.resolution, strict=True))
+        part, (width, height) = (across + down) / 2, device.resolution
+        if part > 0 and abs(part - 1) > OFF_PART and abs(across - down) < SAME_PART * part:
+            yield (f"{field}.principal_px: the calibration is of images of {width}x{height} px, though its principal point would be in the "
+                   f"middle of {part * width:.0f}x{part * height:.0f}: if it was made at that size, multiply focal_px and principal_px by "
+                   f"{1 / part:.3g}")
 
 
 def read_manifest(path: str | Path) -> Manifest:

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -17,9 +17,7 @@ import OpenImageIO as oiio
 from pydantic import ValidationError
 
 from stage import inputs
-from stage.capture.camera import Camera, OtherCamera
 from stage.capture.manifest import FILE_NAME, SCHEMA, Manifest, manifest_text, write_manifest
-from stage.capture.projector import Projector
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
@@ -37,11 +35,6 @@ def light_scale(white: float | None) -> tuple[Literal["relative", "absolute"], f
     """Return the irradiance_scale of a capture, and the irradiance of a light of strength 1.
     `white`: the reading of a white surface that faces such a light, which is its irradiance over π; None: nobody knows it."""
     return ("relative", 1.0) if white is None else ("absolute", math.pi * white)
-
-
-OFF_PART, SAME_PART = 0.2, 0.1
-"""Parts of half a side by which the principal point of a calibration at another size lies off the middle, at least, and by which such a
-part differs between the sides, at most."""
 
 
 MOST_DOUBLED, MOST_NAMED = 0.25, 3
@@ -187,7 +180,6 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         manifest = Manifest.model_validate({"schema": SCHEMA, **data})
     except ValidationError as error:
         raise ManifestError(f"{table}: {describe(error)}") from error
-    manifest = manifest.model_copy(update={"assumed": (*manifest.assumed, *other_sizes(manifest))})
     made = {name: _npy(array) for name, array in (arrays or {}).items()}
     for name, content in made.items():
         target = destination / name
@@ -205,23 +197,6 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
             temporary.write_bytes(before)
     write_manifest(manifest, path)
     return path
-
-
-def other_sizes(manifest: Manifest) -> Iterator[str]:
-    """Yield a sentence for each device whose calibration looks like one at another size of images: its principal point lies off the middle
-    by the same part of both sides, which that of a part of an image or of a shifted lens hardly ever does."""
-    devices: list[tuple[str, Camera | Projector | OtherCamera]] = [("camera", manifest.camera)]
-    devices += [("projector", manifest.projector)] if isinstance(manifest.projector, Projector) else []
-    devices += [(f"other_cameras[{index}]", other) for index, other in enumerate(manifest.other_cameras)]
-    for field, device in devices:
-        if device.focal_px is None or device.principal_px is None:
-            continue
-        across, down = (2 * place / side for place, side in zip(device.principal_px, device.resolution, strict=True))
-        part, (width, height) = (across + down) / 2, device.resolution
-        if part > 0 and abs(part - 1) > OFF_PART and abs(across - down) < SAME_PART * part:
-            yield (f"{field}.principal_px: the calibration is of images of {width}x{height} px, though its principal point would be in the "
-                   f"middle of {part * width:.0f}x{part * height:.0f}: if it was made at that size, multiply focal_px and principal_px by "
-                   f"{1 / part:.3g}")
 
 
 def _made_again(before: bytes, manifest: Manifest) -> bool:
