@@ -46,6 +46,11 @@ class ProcamResult(NamedTuple):
     baseline_m: float
     certainty: Certainty
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the boards leave open."""
+        return self.certainty.warnings()
+
 
 def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> ProcamResult:
     """Calibrate a projector-camera pair, and write camera, projector and their pose to the manifests.

@@ -28,14 +28,15 @@ import inspect
 from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 
 import typer
 from pydantic import BeforeValidator, ValidationError
 
 from service.cli.colours import OcioOption, colours
+from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
@@ -81,15 +82,20 @@ def local_command(group: typer.Typer, name: str, function: Callable[..., None]) 
     command(group, name, function, local=True)
 
 
-def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[..., None]) -> None:
-    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result.
-    `show`: takes the result and, where it has two parameters, the request."""
+def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[..., bool | None]) -> None:
+    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result, and after
+    that the result's warnings.
+    `show`: prints the result, which it takes with, where it has two parameters, the request; where it returns False, the command ends with
+    the exit code 1."""
     with_request = len(inspect.signature(show).parameters) > 1
 
     def run(request: model) -> None:  # type: ignore[valid-type]
-        module, _, function = product.partition(":")
-        result = with_bar(getattr(import_module(module), function), request)
-        show(result, request) if with_request else show(result)
+        work = resolve_name(product)
+        result = with_bar(work, request) if "progress" in inspect.signature(work).parameters else work(request)
+        succeeded = show(result, request) if with_request else show(result)
+        print_warnings(getattr(result, "warnings", ()))
+        if succeeded is False:
+            raise typer.Exit(1)
 
     local_command(group, name, run)
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from service.cli.printing import print_warnings
 from service.cli.request_commands import product_command
 from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest
 
@@ -27,7 +26,7 @@ def register(app: typer.Typer) -> None:
     product_command(app, "board-capability", BoardCapabilityRequest, "service.boards.board_capability:board_capability", _board_capability)
 
 
-def _inspect_board(result: "InspectBoardResult") -> None:
+def _inspect_board(result: "InspectBoardResult") -> bool:
     print(f"height   {result.board_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")
@@ -46,12 +45,10 @@ def _inspect_board(result: "InspectBoardResult") -> None:
         if len(wrong) > MOST_PRINTED:
             print(f"regions  {len(wrong) - MOST_PRINTED} more that did not pass are in the table")
         print(f"verdict  {result.verdict}, {100 * result.inspected:.2f} % inspected")
-    print_warnings(result.warnings)
-    if result.verdict not in (None, "pass"):
-        raise typer.Exit(1)
+    return result.verdict in (None, "pass")
 
 
-def _inspect_paste(result: "InspectPasteResult") -> None:
+def _inspect_paste(result: "InspectPasteResult") -> bool:
     print(f"height   {result.board_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")
@@ -65,9 +62,7 @@ def _inspect_paste(result: "InspectPasteResult") -> None:
     if len(wrong) > MOST_PRINTED:
         print(f"pads     {len(wrong) - MOST_PRINTED} more that did not pass are in the table")
     print(f"verdict  {result.verdict or 'none, without limits'}, {len(result.pads)} pads")
-    print_warnings(result.warnings)
-    if result.verdict not in (None, "pass"):
-        raise typer.Exit(1)
+    return result.verdict in (None, "pass")
 
 
 def _board_capability(result: "BoardCapabilityResult") -> None:
@@ -78,7 +73,6 @@ def _board_capability(result: "BoardCapabilityResult") -> None:
               f"Cp {each.cp:.2f}, {each.boards} boards")
     if result.left_out:
         print(f"left out {len(result.left_out)} that too few boards have or that do not vary: {', '.join(result.left_out[:5])}")
-    print_warnings(result.warnings)
 
 
 def _gauge_board(result: "GaugeBoardResult") -> None:
@@ -94,4 +88,3 @@ def _gauge_board(result: "GaugeBoardResult") -> None:
           f"{result.tolerance_percent_bound:.3g} % of the tolerance" + (", without operators" if study.reproducibility is None else ""))
     if result.left_out:
         print(f"left out {len(result.left_out)} regions that not every run measured: {', '.join(result.left_out[:5])}")
-    print_warnings(result.warnings)

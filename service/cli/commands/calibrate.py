@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import print_table, print_warnings
+from service.cli.printing import print_table
 from service.cli.request_commands import product_command
 from service.requests.calibrate import (
     DarkRequest,
@@ -72,7 +72,6 @@ def _white_balance(result: Any) -> None:
     print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
     for row in result.matrix:
         print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
-    print_warnings(result.warnings)
 
 
 def _chart(result: Any) -> None:
@@ -83,34 +82,29 @@ def _chart(result: Any) -> None:
         for row in kind.colors.matrix:
             print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
         print_table([("patch", "before", "after", "remark"), *kind.rows[:LIGHT_ROWS]])
-    print_warnings(result.warnings)
 
 
 def _procam(result: Any) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m, depths known to {100 * result.certainty.depth:.2g} %")
     print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
-    print_warnings(result.certainty.warnings())
 
 
 def _stereo(result: Any) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.summary}")
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
-    print_warnings(result.warnings)
 
 
 def _laser_planes(result: Any, request: LaserPlanesRequest) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
-    print_warnings(result.warnings)
 
 
 def _response(result: Any) -> None:
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
     print(f"response nearest to level^{result.gamma:.2f}; pixels deviate by {100 * result.spread:.2g} % of full scale")
-    print_warnings(result.warnings)
 
 
 def _tof(result: Any) -> None:
@@ -124,7 +118,6 @@ def _tof(result: Any) -> None:
     print(f"error    {1000 * result.before_m:.2f} mm before, {1000 * result.after_m:.2f} mm after, RMS over {result.steps} steps")
     if result.calibration.sigma_m is not None:
         print(f"sure to  {1000 * result.calibration.sigma_m:.2f} mm")
-    print_warnings(result.warnings)
 
 
 def _rig(result: Any) -> None:
@@ -134,7 +127,6 @@ def _rig(result: Any) -> None:
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
-    print_warnings(result.warnings)
 
 
 def _print_files(manifest_paths: Iterable[Path], report_path: Path) -> None:
@@ -150,10 +142,8 @@ def _print_lights(result: "LightCalibration") -> None:
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
-    print_warnings(result.warnings)
 
 
 def _print_image(name: str, result: "ImageCalibration") -> None:
     print(f"{name:<8} {result.image_path}")
     _print_files((result.manifest_path,), result.report_path)
-    print_warnings(result.warnings)

@@ -1,6 +1,5 @@
 """relit depth, separate, scan, simulate and patterns: from projected light, lasers and time of flight, and what to project."""
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -22,8 +21,8 @@ def register(app: typer.Typer) -> None:
     product_command(app, "separate", SeparateRequest, "service.depth.separate:separate", _separate)
     product_command(app, "scan", ScanRequest, "service.depth.scan:scan", _scan)
     kinds = make_group("simulate", help="The raw frames that a time-of-flight camera would make of a depth.")
-    local_command(kinds, "cw", _simulate_as(SimulateCwRequest))
-    local_command(kinds, "pulsed", _simulate_as(SimulatePulsedRequest))
+    for name, model in (("cw", SimulateCwRequest), ("pulsed", SimulatePulsedRequest)):
+        product_command(kinds, name, model, "service.depth.tof.simulate:simulate_tof", lambda path: print(f"capture  {path}"))
     app.add_typer(kinds)
     local_command(app, "patterns", _patterns)
 
@@ -60,7 +59,6 @@ def _separate(result: Any) -> None:
     print(f"report   {result.report_path}")
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
     print(f"pixels   {counted(result.counts)}")
-    print_warnings(result.warnings)
 
 
 def _scan(result: Any) -> None:
@@ -70,16 +68,6 @@ def _scan(result: Any) -> None:
         print(f"las      {result.las_path}")
     print(f"report   {result.report_path}")
     print(f"shots    {counted(result.counts)}")
-    print_warnings(result.warnings)
-
-
-def _simulate_as(model: type[SimulateCwRequest | SimulatePulsedRequest]) -> Callable[..., None]:
-    def run(request: model) -> None:  # type: ignore[valid-type]
-        from service.depth.tof.simulate import simulate_tof
-
-        print(f"capture  {simulate_tof(request)}")
-
-    return run
 
 
 def _patterns(drawn: Given[PatternsRequest], planned: Given[PlanRequest], plan: PlanOption = False) -> None:

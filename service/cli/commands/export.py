@@ -26,7 +26,8 @@ LONGEST_TEXT = 100
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "export", _export)
-    local_command(app, "blender-extension", _blender_extension)
+    product_command(app, "blender-extension", BlenderExtensionRequest, "service.blender.package:pack",
+                    lambda path: print(f"extension {path}"))
     local_command(app, "inspect", _inspect)
     product_command(app, "basis", BasisRequest, "service.basis.basis:make_basis", _basis)
     product_command(app, "publish", PublishRequest, "service.publish.publish:publish", _publish)
@@ -43,12 +44,6 @@ def _export(request: ExportRequest, progress: ProgressOption = ProgressStyle.BAR
     for name, (vertices, faces) in exported.sizes.items():
         print(f"{name:<8} {vertices} vertices, {faces} faces")
     print_warnings(exported.warnings)
-
-
-def _blender_extension(request: BlenderExtensionRequest) -> None:
-    from service.blender.package import pack
-
-    print(f"extension {pack(request)}")
 
 
 def _inspect(request: InspectRequest) -> None:
@@ -108,7 +103,6 @@ def _publish(result: Any, request: PublishRequest) -> None:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
     if result.levels_rms is not None:
         print(f"error    {result.levels_rms:.2g} of 255 display levels from the captured images (RMS), before JPEG")
-    print_warnings(result.warnings)
 
 
 def _join(result: Any) -> None:
@@ -117,7 +111,6 @@ def _join(result: Any) -> None:
     print(f"report   {result.report_path}")
     print(f"pixels   {pixels['solved']} solved of {pixels['mask']}, {pixels['with_depth']} with a depth")
     print(f"sigma    {sigma['joined_median'] * 1000:.3g} mm, of the depth alone {sigma['depth_median'] * 1000:.3g} mm")
-    print_warnings(result.warnings)
 
 
 def _basis(result: Any) -> None:
@@ -132,4 +125,3 @@ def _basis(result: Any) -> None:
         print(f"lights   {result.left_out} are not in front of the object and are left out")
     if result.near_lights:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
-    print_warnings(result.warnings)

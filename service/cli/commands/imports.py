@@ -1,6 +1,6 @@
 """relit import LAYOUT: make a capture of files that are laid out another way, and say how they were understood."""
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -9,8 +9,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.remote import KeyOption
-from service.cli.request_commands import local_command
-from service.requests.imports.base import ImportRequest
+from service.cli.request_commands import product_command
 from service.requests.imports.layouts import LAYOUTS, request_of, taken_apart
 from service.requests.imports.patterns import InterleavedImport, StereoImport
 from service.requests.imports.scans import ScansImport
@@ -28,15 +27,19 @@ ToOption = Annotated[str | None, typer.Option(
     "--to", metavar="URL", show_default=False, help=(
         "Send the capture to this service, as relit serve prints its address; DST may be left out."))]
 
+IMPORT = "service.captures.importing:import_files"
+"""The product that writes a capture.json for files of any layout."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/importing.md shows each.")
     for name, model in LAYOUTS.items():
-        local_command(layouts, name, _import_as(model))
-    local_command(layouts, "stereo", _import_as(StereoImport))  # of two folders: no layout of one that is uploaded
-    local_command(layouts, "scans", _scans)
-    local_command(layouts, "interleaved", _interleaved)
+        product_command(layouts, name, model, IMPORT, partial(_print, "capture"))
+    product_command(layouts, "stereo", StereoImport, IMPORT, partial(_print, "capture"))  # of two folders: no layout of an upload
+    product_command(layouts, "scans", ScansImport, "service.scans.importing:import_scans", partial(_print, "set"))
+    product_command(layouts, "interleaved", InterleavedImport, "service.acquisition.performance:import_interleaved",
+                    partial(_print, "sequence"))
     layouts.command("guess")(_guess)
 
     @layouts.command("auto")
@@ -81,7 +84,7 @@ def _auto(folder: Path, destination: Path | None, *, kept: bool = True) -> list[
         typed = taken_apart(found.arguments)
         imported = import_files(request_of(typed.layout, typed.source, target, typed.options), found.assumed)
         if kept:
-            _print(imported)
+            _print("capture", imported)
             print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")
         made.append(imported.path.parent)
     return made
@@ -105,28 +108,7 @@ def _print_guess(found: "Guess") -> None:
     print(f"sure     {'yes' if found.sure else 'no: the assumptions, or words in capitals, are yours to check'}")
 
 
-def _import_as(model: type[ImportRequest]) -> Callable[..., None]:
-    def run(request: model) -> None:  # type: ignore[valid-type]
-        from service.captures.importing import import_files
-
-        _print(import_files(request))
-
-    return run
-
-
-def _scans(request: ScansImport) -> None:
-    from service.scans.importing import import_scans
-
-    _print(import_scans(request), "set")
-
-
-def _interleaved(request: InterleavedImport) -> None:
-    from service.acquisition.performance import import_interleaved
-
-    _print(import_interleaved(request), "sequence")
-
-
-def _print(imported: "Imported", made: str = "capture") -> None:
+def _print(made: str, imported: "Imported") -> None:
     """Print where the capture, or what else was made, is, and how the files were understood."""
     print(f"{made:<8} {imported.path}")
     for name, sentence in imported.facts:

@@ -24,10 +24,11 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     rig = make_group("rig", help="Rigs of driven lamps: check them, make them from captures, tables and scenes, plan them; docs/drive.md.")
     local_command(rig, "check", _check)
-    local_command(rig, "from-capture", _from_capture)
-    local_command(rig, "from-csv", _from_csv)
-    local_command(rig, "from-mvr", _from_mvr)
-    local_command(rig, "sweep", _sweep)
+    product_command(rig, "from-capture", RigFromCaptureRequest, "service.rigs.from_capture:rig_from_capture", _made)
+    product_command(rig, "from-csv", RigFromCsvRequest, "service.rigs.from_capture:rig_from_csv", _made)
+    product_command(rig, "from-mvr", RigFromMvrRequest, "service.rigs.from_mvr:rig_from_mvr",
+                    lambda made, request: _made(made.rig, request))
+    product_command(rig, "sweep", RigSweepRequest, "service.rigs.sweep:sweep_rig", _sweep)
     product_command(rig, "plan", RigPlanRequest, "service.rigs.dome_plan:plan_rig", _plan)
     app.add_typer(rig)
     product_command(app, "drive", DriveRequest, "service.drive.drive:drive", _drive)
@@ -42,7 +43,6 @@ def _drive(result: Any) -> None:
     print(f"exposure {result.exposure:.4g}")
     print(f"error    irradiance {100 * result.judgement.rms.max():.2g} % RMS, chromaticity {result.judgement.chromaticity.max():.2g} u'v', "
           f"the largest of {result.frames} frames")
-    print_warnings(result.warnings)
 
 
 def _check(request: RigCheckRequest) -> None:
@@ -61,32 +61,11 @@ def _check(request: RigCheckRequest) -> None:
         raise RequestError("; ".join(f"{request.rig}: {fault}" for fault in found.faults))
 
 
-def _from_capture(request: RigFromCaptureRequest) -> None:
-    from service.rigs.from_capture import rig_from_capture
-
-    rig = rig_from_capture(request)
+def _made(rig: Any, request: RigFromCaptureRequest | RigFromCsvRequest | RigFromMvrRequest) -> None:
     print(f"rig      {request.out}: {len(rig.lights)} lamps")
 
 
-def _from_csv(request: RigFromCsvRequest) -> None:
-    from service.rigs.from_capture import rig_from_csv
-
-    rig = rig_from_csv(request)
-    print(f"rig      {request.out}: {len(rig.lights)} lamps")
-
-
-def _from_mvr(request: RigFromMvrRequest) -> None:
-    from service.rigs.from_mvr import rig_from_mvr
-
-    made = rig_from_mvr(request)
-    print(f"rig      {request.out}: {len(made.rig.lights)} lamps")
-    print_warnings(made.warnings)
-
-
-def _sweep(request: RigSweepRequest) -> None:
-    from service.rigs.sweep import sweep_rig
-
-    made = sweep_rig(request)
+def _sweep(made: Any) -> None:
     print(f"cues     {made.cues}: {made.frames} frames, the first is dark")
     print(f"table    {made.table}")
 

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from service.cli.printing import print_warnings
 from service.cli.request_commands import product_command
 from service.requests.register import CompareRequest, FuseRequest, RegisterRequest
 
@@ -24,7 +23,7 @@ def register(app: typer.Typer) -> None:
     product_command(app, "compare", CompareRequest, "service.comparison.compare:compare", _compare)
 
 
-def _register(result: "RegisterResult") -> None:
+def _register(result: "RegisterResult") -> bool:
     print(f"scans    {result.scan_set_path}")
     print(f"report   {result.report_path}")
     print(f"joined   {result.joined} of {result.scans} scans")
@@ -32,9 +31,7 @@ def _register(result: "RegisterResult") -> None:
         print(f"residual {1e3 * result.residual_m:.3g} mm across the surface (median of the pairs)")
     if result.sigma_m is not None and result.sigma_degrees is not None:
         print(f"sigma    {1e3 * result.sigma_m:.3g} mm and {result.sigma_degrees:.3g}° of the least sure pose")
-    print_warnings(result.warnings)
-    if result.joined < result.scans:
-        raise typer.Exit(1)
+    return result.joined == result.scans
 
 
 def _fuse(result: "FuseResult") -> None:
@@ -54,10 +51,9 @@ def _fuse(result: "FuseResult") -> None:
               "there")
         if closed := {kind: count for kind in ("pinholes", "holes") if (count := holes["closed"].get(kind))}:
             print(f"closed   {' and '.join(f'{count} {kind}' for kind, count in closed.items())}")
-    print_warnings(result.warnings)
 
 
-def _compare(result: "CompareResult") -> None:
+def _compare(result: "CompareResult") -> bool:
     print(f"scan     {result.deviations_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")
@@ -75,6 +71,4 @@ def _compare(result: "CompareResult") -> None:
               f"{region.seen:.0%} seen" + (f", something else on {region.strange} patches" if region.strange else ""))
     if len(result.regions) > MOST_PRINTED:
         print(f"regions  {len(result.regions) - MOST_PRINTED} more are in the table")
-    print_warnings(result.warnings)
-    if not result.passed:
-        raise typer.Exit(1)
+    return result.passed

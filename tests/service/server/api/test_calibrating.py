@@ -159,7 +159,9 @@ def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     request = client.get(f"/v1/jobs/{job['id']}").json()["request"]
     assert request["options"]["board"] == [9, 6] and request["captures"] == ids[:3]
     finish(server, client, job)
-    procam(requests.ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
+    result = procam(requests.ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
+    log = client.get(f"/v1/jobs/{job['id']}/log").json()["entries"]
+    assert [entry["text"] for entry in log if entry["text"].startswith("warning: ")] == [f"warning: {said}" for said in result.warnings]
     report = calibrated(client, job, ids, folders)["procam"]
     assert report["captures"] == [view["view"] for view in report["views"]] == ids[:3]
     assert report["options"]["apply_to"] == ids[3:]
