@@ -29,8 +29,8 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.neighbours import neighbours_are_installed
-from stage.files import replacing, write_text
-from stage.formats.ply import COLOUR, NORMAL, POSITION, header
+from stage.files import write_text
+from stage.formats.ply import COLOUR, NORMAL, POSITION, write_vertices
 from stage.sets.scan_set import UNITS_M
 from stage.sets.tolerance_regions import ToleranceRegion, read_tolerances
 from stage.stack import fingerprint
@@ -228,22 +228,11 @@ def _facts(found: Deviations, sigma: np.ndarray, points: int, span: float) -> di
 
 def _write_ply(path: Path, scan: ScannedSurface, found: Deviations, sigma: np.ndarray, colours: np.ndarray) -> None:
     """Write the placed scan with its deviations and their σ, NaN where a point does not belong to the design."""
-    kind = np.dtype([*((name, "<f4") for name in (*POSITION, *NORMAL, "deviation", "sigma")), *((name, "u1") for name in COLOUR)])
-    values = np.empty(len(scan.points), dtype=kind)
-    for names, columns in ((POSITION, found.placed), (NORMAL, found.normals), (COLOUR, np.rint(255 * colours))):
-        for column, name in enumerate(names):
-            values[name] = columns[:, column]
-    for name, known in (("deviation", found.distance), ("sigma", sigma)):
-        values[name] = np.nan
-        values[name][found.near] = known
-    with replacing(path) as temporary, open(temporary, "wb") as stream:
-        comments = ("deviations from a design by relit compare", "coordinates in metres, in the frame of the design")
-        stream.write(header(kind, len(values), comments, faces=None if scan.faces is None else len(scan.faces)))
-        values.tofile(stream)
-        if scan.faces is not None:
-            entries = np.empty(len(scan.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-            entries["count"], entries["corners"] = 3, scan.faces
-            entries.tofile(stream)
+    measured = np.full((len(scan.points), 2), np.nan)
+    measured[found.near] = np.column_stack([found.distance, sigma])
+    write_vertices(path, {POSITION: found.placed, NORMAL: found.normals, ("deviation", "sigma"): measured,
+                          COLOUR: np.rint(255 * colours).astype(np.uint8)}, faces=scan.faces,
+                   comments=("deviations from a design by relit compare", "coordinates in metres, in the frame of the design"))
 
 
 def colours_of(found: Deviations, span_m: float) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Point clouds as binary PLY files: float32 x y z, uchar red green blue, and what else is known: normals, intensity, σ, confidence."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,8 @@ TYPES = {np.dtype("<f4"): "float", np.dtype("<u2"): "ushort", np.dtype("u1"): "u
 """The names of the types that are written."""
 MAX_HEADER = 1 << 16
 """The bytes within which the header of a file must end."""
+BATCH = 1 << 20
+"""The number of entries that are written together, which bounds the memory."""
 
 
 class PointCloud(NamedTuple):
@@ -31,34 +33,40 @@ class PointCloud(NamedTuple):
 
 
 def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
-    """Write a point cloud as PLY whole or not at all: position, normal, colour, intensity, σ and confidence, those that are known.
+    """Write a point cloud as PLY whole or not at all: position, normal, colour, intensity, σ and confidence, those that are known."""
+    scalars = zip(((name,) for name in SCALARS), (cloud.intensity, cloud.sigma, cloud.confidence), strict=True)
+    write_vertices(path, {POSITION: cloud.points, NORMAL: cloud.normals, COLOUR: cloud.colours, **dict(scalars)}, comments=comments)
+
+
+def write_vertices(path: str | Path, columns: Mapping[tuple[str, ...], np.ndarray | None], *, comments: tuple[str, ...],
+                   faces: np.ndarray | None = None) -> None:
+    """Write vertices, and the faces between them, as a binary PLY file, whole or not at all.
+    `columns`: the values of properties, [vertices] or [vertices, properties], stored as uint8 or uint16 if they are, else as float32; None:
+    the file has no such properties. `faces`: [faces, 3] numbers of their vertices; None: the file has none.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
     """
-    scalars = [((name,), None if values is None else values[:, None]) for name, values in
-               zip(SCALARS, (cloud.intensity, cloud.sigma, cloud.confidence), strict=True)]
-    known = [(names, columns) for names, columns in ((POSITION, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), *scalars)
-             if columns is not None]
-    kind = _type(name for names, _ in known for name in names)
-    values = np.empty(len(cloud.points), dtype=kind)
-    for names, columns in known:
-        for column, name in enumerate(names):
-            values[name] = columns[:, column]
-    with replacing(path) as temporary, open(temporary, "wb") as stream:
-        stream.write(header(kind, len(values), comments))
-        values.tofile(stream)
-
-
-def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int | None = None) -> bytes:
-    """Return the header of a binary PLY file.
-    `vertex`: the type of a vertex, whose fields are float32, uint16 or uint8. `faces`: the number of faces, lists of int32 vertex numbers
-    behind the vertices; None: the file has none."""
+    known = {names: values.reshape(len(values), len(names)) for names, values in columns.items() if values is not None}
+    kind = np.dtype([(name, values.dtype.newbyteorder("<") if values.dtype.kind == "u" else "<f4")
+                     for names, values in known.items() for name in names])
+    count = len(next(iter(known.values())))
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
-             f"element vertex {count}", *(f"property {TYPES[vertex[name]]} {name}" for name in vertex.names or ())]
+             f"element vertex {count}", *(f"property {TYPES[kind[name]]} {name}" for name in kind.names or ())]
     if faces is not None:
-        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace"))
+        for start in range(0, count, BATCH):
+            rows = np.empty(min(BATCH, count - start), dtype=kind)
+            for names, values in known.items():
+                for column, name in enumerate(names):
+                    rows[name] = values[start:start + BATCH, column]
+            rows.tofile(stream)
+        for corners in () if faces is None else np.split(faces, range(BATCH, len(faces), BATCH)):
+            entries = np.empty(len(corners), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+            entries["count"], entries["corners"] = 3, corners
+            entries.tofile(stream)
 
 
 def read_ply(path: str | Path) -> PointCloud:
