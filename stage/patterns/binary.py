@@ -16,11 +16,11 @@ from stage.model import Count, Positive, Strict
 from stage.patterns.base import Axis, Index, UniformPattern, check_agreement, check_index, digit_count, stripe_count, uniform_patterns
 
 
-class BinaryPattern(Strict):
-    """One bit of the code floor(u / stripe_px); gray: of c XOR (c >> 1). Bit bits - 1 is the coarsest."""
+class _BitPattern(Strict):
+    """One bit of a number that every stripe has."""
 
-    code: Literal["binary", "gray"]
-    """The code: the number of the stripe, or its Gray code."""
+    code: str
+    """The code."""
     axis: Axis
     """The axis of the projector along which the code varies."""
     bit: Index
@@ -37,18 +37,25 @@ class BinaryPattern(Strict):
         check_index("bit", self.bit, self.bits, "bits")
         return self
 
+    def describe(self) -> str:
+        """Return a few words that name the frame."""
+        return f"{self.axis} {self.code} bit {self.bit} of {self.bits}{', inverse' if self.inverse else ''}"
+
+
+class BinaryPattern(_BitPattern):
+    """One bit of the code floor(u / stripe_px); gray: of c XOR (c >> 1). Bit bits - 1 is the coarsest."""
+
+    code: Literal["binary", "gray"]
+    """The code: the number of the stripe, or its Gray code."""
+
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return 0 or 1 at each place."""
         number = np.floor(u / self.stripe_px).astype(np.int64)
         word = gray_of(number) if self.code == "gray" else number
         return (word >> self.bit & 1 ^ int(self.inverse)).astype(np.float64)
 
-    def describe(self) -> str:
-        """Return a few words that name the frame."""
-        return _describe(self)
 
-
-class XorPattern(Strict):
+class XorPattern(_BitPattern):
     """One bit of the Gray code with bit base_bit laid over it by XOR: no stripe is wide, so that light between surfaces averages out.
 
     Bits above base_bit are shown as their XOR with it; base_bit and the bits below it, which are as fine, as they are. XOR-02 of
@@ -57,22 +64,11 @@ class XorPattern(Strict):
 
     code: Literal["xor"]
     """The code."""
-    axis: Axis
-    """The axis of the projector along which the code varies."""
-    bit: Index
-    """The bit that the frame shows: `bits` - 1 is the coarsest, 0 the finest."""
-    bits: Count
-    """The number of bits of the code."""
     base_bit: Index = 0
     """The bit that is laid over the coarser ones."""
-    stripe_px: Positive = 1
-    """The width of the finest stripe in projector pixels."""
-    inverse: bool = False
-    """True if black and white are exchanged."""
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_index("bit", self.bit, self.bits, "bits")
+    def _check_base(self) -> Self:
         check_index("base_bit", self.base_bit, self.bits, "bits")
         return self
 
@@ -83,10 +79,6 @@ class XorPattern(Strict):
         if self.bit > self.base_bit:
             bit ^= gray >> self.base_bit & 1
         return (bit ^ int(self.inverse)).astype(np.float64)
-
-    def describe(self) -> str:
-        """Return a few words that name the frame."""
-        return _describe(self)
 
 
 class BinaryCode(NamedTuple):
@@ -158,7 +150,3 @@ def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float
     frames = [XorPattern(code="xor", axis=axis, bit=bit, bits=bits, base_bit=base_bit, stripe_px=stripe_px, inverse=inverse)
               for bit in reversed(range(bits)) for inverse in ((False, True) if inverses else (False,))]
     return (*frames, *uniform_patterns())
-
-
-def _describe(pattern: BinaryPattern | XorPattern) -> str:
-    return f"{pattern.axis} {pattern.code} bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverse else ''}"

@@ -49,26 +49,11 @@ class Cost(NamedTuple):
 class Plan(NamedTuple):
     """One line of the planner's table."""
 
-    name: str
-    minimum: int
-    """Images of one axis by the count of Nayar's lecture 3-5."""
-    images: int
-    """Images as projected here."""
+    cost: Cost
     seconds: float
     """Time to capture the images."""
-    column_sigma_px: float
     depth_sigma_m: float | None
     """Standard deviation of the depth, metres; None without a rig."""
-
-
-def point_count(columns: int, rows: int) -> int:
-    """Return the images that light every projector pixel alone."""
-    return columns * rows
-
-
-def line_count(columns: int) -> int:
-    """Return the images that light every column alone."""
-    return columns
 
 
 def kary_count(columns: int, base: int = 2) -> int:
@@ -101,11 +86,6 @@ def ramp_sigma(columns: int, noise: float) -> float:
     return columns * float(np.sqrt(2 / 3)) * noise / 2
 
 
-def micro_sigma(mean_period_px: float, periods: int, noise: float) -> float:
-    """Return the standard deviation of the column from micro phase shifting, projector pixels."""
-    return phase_sigma((mean_period_px,), periods + 2, noise)
-
-
 def modulated_sigma(period_px: float, steps: int, carrier_steps: int, noise: float) -> float:
     """Return the standard deviation of the column from modulated phase shifting, projector pixels.
 
@@ -126,5 +106,4 @@ def tabulate(costs: Iterable[Cost], *, frame_rate: float, rig: Rig | None = None
     """Return the table: what each code costs in time and, with a rig, how precise its depth is."""
     if not frame_rate > 0:
         raise ValueError(f"the frame rate is {frame_rate:g}: give images a second, more than 0")
-    return tuple(Plan(cost.name, cost.minimum, cost.images, cost.images / frame_rate, cost.column_sigma_px,
-                      None if rig is None else depth_sigma(rig, cost.column_sigma_px)) for cost in costs)
+    return tuple(Plan(cost, cost.images / frame_rate, None if rig is None else depth_sigma(rig, cost.column_sigma_px)) for cost in costs)

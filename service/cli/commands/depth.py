@@ -94,7 +94,8 @@ def _print_plan(request: PlanRequest) -> None:
     print(f"{'code':<34} {'at least':>9} {'images':>9} {'seconds':>9} {'column ± px':>12} {'depth ± mm':>11}")
     for row in rows:
         depth = "" if row.depth_sigma_m is None else f"{1000 * row.depth_sigma_m:.3g}"
-        print(f"{row.name:<34} {row.minimum:>9} {row.images:>9} {row.seconds:>9.3g} {row.column_sigma_px:>12.3g} {depth:>11}")
+        cost = row.cost
+        print(f"{cost.name:<34} {cost.minimum:>9} {cost.images:>9} {row.seconds:>9.3g} {cost.column_sigma_px:>12.3g} {depth:>11}")
 
 
 def _write(drawn: Given[PatternsRequest], plan: bool) -> None:

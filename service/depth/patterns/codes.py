@@ -92,7 +92,7 @@ def _phase_cost(request: PlanRequest, columns: int) -> Cost:
 def _micro_cost(request: PlanRequest, columns: int) -> Cost:
     periods, count = _periods(request, columns), request.micro_periods
     mean = sum(periods) / len(periods)
-    return Cost(f"micro, {count} periods about {mean:g} px", count + 2, count + 2, planner.micro_sigma(mean, count, request.noise))
+    return Cost(f"micro, {count} periods about {mean:g} px", count + 2, count + 2, planner.phase_sigma((mean,), count + 2, request.noise))
 
 
 CODES: dict[PatternCode, CodeRow] = {

@@ -135,9 +135,6 @@ def test_what_cannot_be_drawn_is_one_sentence(call, words):
 
 
 def test_the_lectures_counts():
-    assert planner.point_count(640, 480) == 307200
-    assert planner.point_count(640, 480) / 30 / 3600 == pytest.approx(2.84, abs=0.01)  # nearly 3 hours at 30 fps
-    assert planner.line_count(640) / 30 == pytest.approx(21.3, abs=0.1)
     assert planner.kary_count(255) == 8 and planner.kary_count(256) == 9
     assert planner.kary_count(7) == 3
     assert planner.kary_count(7, 3) == 2 and planner.kary_count(8, 3) == 2 and planner.kary_count(9, 3) == 3
@@ -182,7 +179,7 @@ COST = planner.Cost("line", 8, 10, 0.3)
 
 def test_a_line_of_the_table():
     row, = planner.tabulate([COST], frame_rate=30, rig=RIG)
-    assert row[:3] == COST[:3] and row.seconds == pytest.approx(1 / 3)
+    assert row.cost == COST and row.seconds == pytest.approx(1 / 3)
     assert row.depth_sigma_m == planner.depth_sigma(RIG, 0.3)
     assert planner.tabulate([COST], frame_rate=30)[0].depth_sigma_m is None
 

@@ -62,13 +62,13 @@ def test_plan_is_a_table(relit):
 def test_every_code_has_a_row_and_the_planner_knows_its_cost():
     assert set(CODES) == set(PatternCode)
     rows = make_plan(PlanRequest(projector=(1280, 800), frame_rate=30, baseline=0.2, distance=1, focal=2000))
-    assert [row.name.split(",")[0] for row in rows] == ["point", "line", "binary or gray", "xor", "kary", "ramp", "phase", "micro",
+    assert [row.cost.name.split(",")[0] for row in rows] == ["point", "line", "binary or gray", "xor", "kary", "ramp", "phase", "micro",
                                                         "modulated"]
-    by_name = {row.name.split(",")[0]: row for row in rows}
-    assert by_name["binary or gray"].minimum == 11 and by_name["binary or gray"].images == 24
-    assert by_name["kary"].minimum == 7
-    assert by_name["phase"].images == 12 and by_name["phase"].seconds == pytest.approx(0.4)
-    assert all(row.images >= row.minimum and row.column_sigma_px > 0 and row.depth_sigma_m > 0 for row in rows)
+    by_name = {row.cost.name.split(",")[0]: row for row in rows}
+    assert by_name["binary or gray"].cost.minimum == 11 and by_name["binary or gray"].cost.images == 24
+    assert by_name["kary"].cost.minimum == 7
+    assert by_name["phase"].cost.images == 12 and by_name["phase"].seconds == pytest.approx(0.4)
+    assert all(row.cost.images >= row.cost.minimum and row.cost.column_sigma_px > 0 and row.depth_sigma_m > 0 for row in rows)
     assert make_plan(PlanRequest(projector=(1280, 800)))[0].depth_sigma_m is None
 
 
