@@ -49,7 +49,6 @@ SOLVED = (Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED)
 ESTIMATED = (*SOLVED, Status.UNSURE, Status.UNDECIDED, Status.MULTIPATH, Status.FLYING)
 """Codes of pixels that may carry values. A solver that has no estimate at a pixel of the last three leaves it 0."""
 
-
 UNSOLVED = int(Status.UNSOLVED)
 OK = int(Status.OK)
 TOO_FEW_LIGHTS = int(Status.TOO_FEW_LIGHTS)

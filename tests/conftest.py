@@ -17,7 +17,6 @@ for ignored in (signal.SIGINT, signal.SIGHUP):
         # what is handled, so that programs that tests start take signals as ever
         signal.signal(ignored, lambda *_: None)
 
-
 LONG_PARTS, EMULATED_PARTS = 20, 6
 """What .ci/run takes the long tests in, and those on the emulated device, one part of each for a commit: all take an hour."""
 

@@ -40,7 +40,6 @@ LEAST_EVEN = 0.02
 LARGEST_RESIDUAL_PX = 1.0
 """Largest root mean square distance of the lines of a stripe on a step from where the planes put them."""
 
-
 Along = Literal["row", "column"]
 ALONG: tuple[Along, ...] = ("row", "column")
 LENS_SIGMAS, LEAST_FOCAL, LEAST_BENT_PX = 4.0, 0.005, 0.3

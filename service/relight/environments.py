@@ -19,7 +19,6 @@ SHARP_RADIUS_DEGREES = 2.0
 """Largest angular radius of a map's sample that casts shadows of its own: small samples lie where the map is bright. The visibility of
 other samples is interpolated from the captured lights around them."""
 
-
 RADIANS, SAME_TURN = (np.pi / 2, np.pi, 2 * np.pi, 4 * np.pi), 0.002
 """Turns in radians, and the part by which a turn in degrees is near one, with which it is said: 1.57, 3.14 and 6.28 are."""
 FEW_ROWS = 16

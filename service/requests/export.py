@@ -32,7 +32,6 @@ TIME_SAMPLED = [name for name, facts in FORMATS.items() if facts.time_sampled]
 FIRST_VERSION = "1"
 """Version of an asset that nobody gave one."""
 
-
 MOST_LEVELS = 4
 """Levels of detail that an asset can have: the fourth has a 256th of the faces."""
 

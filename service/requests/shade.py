@@ -14,7 +14,6 @@ Vector = tuple[float, float, float]
 RIGHT_ANGLE = 1e-3
 """The largest absolute cosine between the edges of a rectangle."""
 
-
 BRIGHTEST = 1e15
 """The largest value of a light: far brighter than half can show, and safe from overflow."""
 

@@ -16,7 +16,6 @@ MAX_SIGMA = 30.0
 """Largest standard error, in degrees, of a normal that counts as solved, unless the request says otherwise: a normal this far off says
 little more than that the surface faces the camera."""
 
-
 BRIGHT_ALBEDO, ALBEDO_PERCENTILE = 0.8, 99.0
 """The albedo, that of white paint, which bright pixels of a capture of relative lights are given, and the percentile that is bright."""
 

@@ -18,7 +18,6 @@ LOOSE = 2.0
 SYSTEMATIC = 3.0
 """Residuals of pairs in units of σ from which it is said."""
 
-
 PAIRS = "pairs and pose graph"
 """The method of a registration by pairs, as the report names it."""
 

@@ -28,7 +28,6 @@ OFF_PART, SAME_PART = 0.2, 0.1
 """Parts of half a side by which the principal point of a calibration at another size lies off the middle, at least, and by which such a
 part differs between the sides, at most."""
 
-
 ColorMatrix = tuple[Vector, Vector, Vector]
 
 

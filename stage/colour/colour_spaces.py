@@ -40,7 +40,6 @@ _LINEAR_OF: dict[str, str] = {
     "g22_adobergb_scene": "lin_adobergb_scene",
 }
 
-
 _AS_GIVEN: ContextVar[bool] = ContextVar("_AS_GIVEN", default=False)
 
 

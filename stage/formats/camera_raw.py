@@ -27,7 +27,6 @@ COLOURS = {"R": 0, "G": 1, "B": 2}
 WEIGHTS = (1, 2, 1), (1, 4, 6, 4, 1)
 """Weights along rows and columns of the neighbours that colours are taken from, for mosaics of 2 × 2 pixels and for others."""
 
-
 XYZ_FROM_REC709 = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 """ITU-R BT.709 primaries with the white D65, in the digits that LibRaw uses."""
 SINGULAR = 1e-9

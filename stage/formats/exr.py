@@ -33,11 +33,9 @@ class Compression:
 DWA_LEVEL = 45.0
 """The compression level of DWAA, for which 0 loses least: the default of the library, stated in the file."""
 
-
 LARGE_VALUES = 1 << 22
 """The number of values from which an image is compressed and decoded by threads of the library, which start once in a process."""
 _starting = threading.Lock()
-
 
 DATA = "data"
 """The `colorInteropID` of channels that are no colours, which no reader should convert (Color Interop Forum)."""
@@ -222,7 +220,6 @@ PRIMARIES = ("lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_
 """The scene-linear colour spaces with which `chromaticities` are compared."""
 PRIMARIES_TOLERANCE = 2e-3
 """The largest difference of a chromaticity coordinate, because writers round the coordinates."""
-
 
 WRITTEN_BY_OIIO = {
     "acescg": "lin_ap1_scene", "lin_ap1": "lin_ap1_scene", "aces2065-1": "lin_ap0_scene", "lin_ap0": "lin_ap0_scene",

@@ -34,12 +34,10 @@ SMOOTH = 0.2
 LEAST_LIT = 200
 """Least count of pixels that must be lit for stripes to be told."""
 
-
 BESIDE = 2
 """Pixels on either side of an edge at which other stripes are looked at."""
 WIDE = 8
 """Least mean width of the finer stripes, in pixels, that are compared with the coarser ones."""
-
 
 PAIRED, UNLIKE = 0.15, 0.3
 """Largest difference of the sums of images and their inverses, over their median: encoded images of blurred stripes add up to an eighth

@@ -17,7 +17,6 @@ from stage.importers.opencv_file import read_matrices
 
 T = TypeVar("T")
 
-
 UNKNOWN_LIGHTS = " --lights unknown"
 """What ends the command of a solve that finds the lights."""
 

@@ -28,7 +28,6 @@ PROJECTOR_SIZE = ("screenResX", "screenResY")
 PIXEL_CENTRE = 0.5
 """The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
-
 LEAST_BASELINE_M = 1e-4
 """The least distance of two devices, below which their lenses would be one."""
 

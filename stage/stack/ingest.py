@@ -33,7 +33,6 @@ from stage.stack.stack_file import StackFile
 if TYPE_CHECKING:
     from stage.motion.flow import Flow
 
-
 VERSION = 1
 """The version of the alignment; a change of the arithmetic raises it, so that older caches are rebuilt."""
 DARKEST = 0.05

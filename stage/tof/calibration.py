@@ -21,7 +21,6 @@ seventh and ninth to the eighth, and their products to the twelfth; a third harm
 SWEEP_PART = 0.5
 """The part of a period that a sweep must cover: a table from less would be extrapolated over most of the period."""
 
-
 LEAST_TERM = 1e-6
 """Singular values of the terms below this part of the largest are none: phases that no distance shows leave them open."""
 

@@ -18,7 +18,6 @@ pytestmark = pytest.mark.long
 OWL_LIGHTS = (44, 31)
 """The light of the owl that is nearest to the view axis, and one 20 degrees from it."""
 
-
 THE_OWL = """
 from mathutils import Vector
 settings(capture=given["capture"], levels=1)

@@ -56,7 +56,6 @@ SURFACES = {
                                diffuse_albedo=3 * convert(TWO.diffuse_albedo, "lin_rec709_scene", "lin_ap1_scene")),
 }
 
-
 WAYS = {
     "usdz": {}, "usdz, 8 bits": {"textures": TextureFormat.PNG8}, "usdz, levels": {"levels": 2}, "usdc": {}, "usdc, levels": {"levels": 1},
     "usda, EXR": {"textures": TextureFormat.EXR}, "glb": {"textures": TextureFormat.PNG16}, "glb, 8 bits": {"textures": TextureFormat.PNG8},

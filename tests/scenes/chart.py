@@ -15,7 +15,6 @@ PITCH, PATCH = 47.0, 40.0
 PASSPORT_PATCH = 0.71
 """The side of a patch of a ColorChecker Passport over their spacing: 100 / 141 in the template of colour-checker-detection 0.2.3."""
 
-
 WHITE_D50 = np.array([0.96422, 1.0, 0.82521])
 D65_FROM_D50 = np.array([[0.9555766, -0.0230393, 0.0631636], [-0.0282895, 1.0099416, 0.0210077], [0.0122982, -0.0204830, 1.3299098]])
 REC709_FROM_XYZ = np.array([[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]])

@@ -32,7 +32,6 @@ ROUNDS = 10
 BISECTIONS = 10
 """Steps of the bisection for the roughness, down to 2⁻¹⁰ of its range."""
 
-
 MIN_ROUGHNESS, MAX_ROUGHNESS = 0.05, 1.0
 """Range of roughness in the table: below it, a lobe under a gradient equals a mirror to four digits."""
 MAX_ANGLE = np.radians(85.0)

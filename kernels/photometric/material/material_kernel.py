@@ -25,7 +25,6 @@ COMMON_ROUNDS = 3
 """Rounds of the fit of an F0 that the channels share. Each round fixes which channels have an albedo above 0; after three this no longer
 changes."""
 
-
 TINTED = wp.constant(0)
 """Fit mode with free roughness and an own F0 for each channel, as metals need."""
 NEUTRAL = wp.constant(1)

@@ -44,7 +44,6 @@ which hardly anything is known count as solved unless less than that is asked fo
 APART_DEGREES, APART_SIGMAS = 4.0, 3.0
 """A candidate belongs to another mode when it is further away than this, in degrees and in standard deviations."""
 
-
 UNDESCRIBED = 0.9
 """Logarithm of the factor on the standard deviation where half of the readings contradict the normal."""
 

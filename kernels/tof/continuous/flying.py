@@ -6,7 +6,6 @@ Source: Sabov and Krüger, "Identification and correction of flying pixels in ra
 straight lines through its neighbours on either side and by their standard deviations.
 """
 
-
 import numpy as np
 import warp as wp
 

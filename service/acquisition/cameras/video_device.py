@@ -1,6 +1,5 @@
 """A video device (UVC, V4L2), or a video file in its place, through OpenCV."""
 
-
 import cv2
 import numpy as np
 

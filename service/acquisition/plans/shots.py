@@ -33,7 +33,6 @@ FLAT = "flat"
 TRACKING = "tracking"
 """The end of the names of pictures under full light, which show whether something moved; of white ones between patterns also the folder."""
 
-
 SEEN = 4
 """Number of lamps around a surface that light it together as one at normal incidence does."""
 

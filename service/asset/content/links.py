@@ -25,7 +25,6 @@ LEAST_FACING = 1e-2
 ISLAND_PIXELS = 8
 """Patches of fewer linked pixels are left out: two pixels more than what noise on the rim of a mask makes."""
 
-
 _ALL, _FIRST, _LAST = slice(None), slice(None, -1), slice(1, None)
 NEIGHBOURS = ((_ALL, _FIRST), (_ALL, _LAST)), ((_FIRST, _ALL), (_LAST, _ALL))
 """Pixels and those to their right; pixels and those below them."""

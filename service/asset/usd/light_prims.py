@@ -84,7 +84,6 @@ DISPLAY_DISTANCE = 1.5
 GRADIENT_ROWS = 64
 """Rows of the texture of a gradient: linear between them it is within 1e-3 of (1 ± ω)/2."""
 
-
 Placed = DistantLight | PointLight | ExtendedLight | GradientLight | EnvironmentLight
 """The types of light whose place is known."""
 

@@ -31,7 +31,6 @@ LEAST_OTHERS = 3
 UNIT_PX = 1000.0
 """Focal length of the camera without distortion in whose image corners are compared; any will do."""
 
-
 LEAST_BOARDS = 3
 """Boards from which a focal length follows."""
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from stage.importers.folder import Guess
     from stage.importers.layout import Imported
 
-
 FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the data.", show_default=False)]
 DestinationArgument = Annotated[Path | None, typer.Argument(metavar="DST", show_default=False, help=(
     "Folder for the capture, which gets links to the files; without it capture.json is written beside them."))]

@@ -39,7 +39,6 @@ Commas = BeforeValidator(_split_commas)
 WidthHeight = BeforeValidator(_sides)
 """Marks two numbers that may be given as one text with an x between."""
 
-
 CropBox = tuple[NotNegativeCount, NotNegativeCount, Count, Count]
 """The first column, the first row, the width and the height of a rectangle of an image."""
 

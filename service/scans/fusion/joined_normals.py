@@ -44,7 +44,6 @@ NEAR = 0.2
 MOST_NEAR = 1e4
 """Bound of the weight by which the ends of a short edge share a direction."""
 
-
 _OfMotions = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Takes the motions [V] of the vertices, metres, and which of these move."""
 

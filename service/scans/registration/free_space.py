@@ -41,7 +41,6 @@ HIDES, MOST_HIDDEN = 6.0, 0.1
 """A point is behind others of its set from so many distances of neighbours on. A set of which more than this part is was not seen from one
 place, and says nothing."""
 
-
 LEAST_SPREAD = 1e-3
 """Spread in radians of the lines of sight of a set, below which they are parallel and meet nowhere: of a scanner, a set of a hundredth of
 its distance in size has three times that."""

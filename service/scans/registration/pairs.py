@@ -64,7 +64,6 @@ AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
 """Another pose fits as well if its residual is at most this many times that of the best, its overlap at least that part of it, and not
 this much more of it is contradicted."""
 
-
 SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
 """The scale of a scan is told if it differs from 1 by so many standard deviations and by these parts."""
 

@@ -22,7 +22,6 @@ once: a job or a person killed it, and `max_lost` ends a job that kills workers.
 KILL_AFTER_S = 10.0
 """Seconds beyond `drain_s` before a worker that does not end is killed."""
 
-
 READY, BEAT, STEP = range(3)
 
 

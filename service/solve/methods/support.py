@@ -138,7 +138,6 @@ the object, 0.28 to 0.5 if the general normals are better, real and path-traced,
 where it does not, and its normals are no refuge, up to 0.81 under noise, flicker and JPEG, 0.86 and more for velvet and lights in wrong
 order."""
 
-
 UNSUPPORTED_PULL, DOUBTFUL_PULL = 10.0, 0.5
 """Strengths of the prior towards the normals of a simpler method. The first is a standard deviation of some degrees for a reading that
 misfits by the noise floor of the search, where what the simpler method leaves is noise, or lobes do not describe it. The second serves

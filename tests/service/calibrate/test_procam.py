@@ -32,7 +32,6 @@ BOARD = "--board", "9x6", "--square-m", 0.03
 WORDS = *BOARD, "--projector", "256x192"
 PLAIN_CAMERA = {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}
 
-
 PATTERNS = [*(wave for axis in ("column", "row") for period in (24, 25) for wave in phase_patterns(axis, period, 3)), *BLACK_WHITE]
 
 

@@ -1,6 +1,5 @@
 """The response of a projector from images of its grey levels."""
 
-
 import numpy as np
 import pytest
 

@@ -88,7 +88,6 @@ OWN = {
 KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.RelightJob, "shade": jobs.ShadeJob, "export": jobs.ExportJob,
          "view": jobs.ViewJob}
 
-
 PROGRAM: Any = get_command(program())
 
 

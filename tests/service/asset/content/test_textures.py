@@ -18,7 +18,6 @@ from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 
 """As published for ACEScg with the Bradford adaptation."""
 
-
 CODE = 0.5 / 65535 * 2.28 + 1.5e-5
 """Half a code of 16 bits, times the steepest slope of the sRGB curve, and the fast powers of OpenColorIO."""
 

@@ -18,7 +18,6 @@ VOXEL = 2e-3
 RESOLVED = 1.0
 """Degrees that the face between three exact vertices errs by at most where the mesh resolves the surface."""
 
-
 NOISE = [(name, DEPTH_SIGMA if name == "plates" else 3 * DEPTH_SIGMA) for name in SCENES]
 """Scenes, and the standard deviation of their depths in metres."""
 

@@ -1,6 +1,5 @@
 """What becomes of jobs: those that fail, are tried again, cancelled, resumed or put first, and what their log says."""
 
-
 import httpx2
 import pytest
 

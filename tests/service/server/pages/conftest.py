@@ -31,7 +31,6 @@ PAGE_BYTES = 3_000_000
 MAX_SIGMA = 0.3
 """Largest standard error in degrees of a normal that counts as solved here, so that the capture has unsure pixels too."""
 
-
 PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
 """The folder for the pictures of the documentation; without it they are made and dropped."""
 

@@ -1,6 +1,5 @@
 """The page for operators: workers, queue, space, errors and the audit log, for those who may see them."""
 
-
 import pytest
 
 from service.requests.keys import Scope

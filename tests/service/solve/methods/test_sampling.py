@@ -1,6 +1,5 @@
 """relit solve on captures under diffused sources: from images on disk to maps.exr, with a known truth."""
 
-
 import numpy as np
 import pytest
 
