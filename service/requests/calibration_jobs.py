@@ -4,22 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from service.requests import calibrate
 from service.requests.base.base import CAPTURE, JobRequest, Role, Spelling
 from service.requests.base.identifiers import CaptureId
-from service.requests.calibrate import (
-    IMAGES,
-    LEAST_GREYS,
-    POSES,
-    BoardOptions,
-    GreyBallOptions,
-    IntensityOptions,
-    LaserPlanesOptions,
-    LightPositionsOptions,
-    MirrorBallOptions,
-    ProcamOptions,
-    ResponseOptions,
-    WhiteBalanceOptions,
-)
 from service.requests.chart import ChartOptions
 from service.requests.drive import RIG, RigDocument
 from service.requests.rig import RigCalibrationOptions
@@ -49,28 +36,28 @@ class MirrorBallJob(BallJob):
     """Directions of far lights from one mirror ball: capture.json, calibration.json."""
 
     kind: Literal["calibrate-mirror-ball"]
-    options: MirrorBallOptions = MirrorBallOptions()
+    options: calibrate.MirrorBallOptions = calibrate.MirrorBallOptions()
 
 
 class LightPositionsJob(BallJob):
     """Positions of near lights from two or more mirror balls: capture.json, calibration.json."""
 
     kind: Literal["calibrate-light-positions"]
-    options: LightPositionsOptions = LightPositionsOptions()
+    options: calibrate.LightPositionsOptions = calibrate.LightPositionsOptions()
 
 
 class GreyBallJob(BallJob):
     """Brightness of each light from one grey ball: capture.json, calibration.json."""
 
     kind: Literal["calibrate-grey-ball"]
-    options: GreyBallOptions = GreyBallOptions()
+    options: calibrate.GreyBallOptions = calibrate.GreyBallOptions()
 
 
 class IntensityJob(CalibrationJob):
     """Brightness of lights of known direction from images of the object itself: capture.json, calibration.json."""
 
     kind: Literal["calibrate-intensity"]
-    options: IntensityOptions = IntensityOptions()
+    options: calibrate.IntensityOptions = calibrate.IntensityOptions()
 
 
 class DarkJob(JobRequest):
@@ -79,7 +66,7 @@ class DarkJob(JobRequest):
     kind: Literal["calibrate-dark"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture that the images lie in and belong to."""
-    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, calibrate.IMAGES]
     """Names of the images in the capture's folder, of its resolution and encoding, at the exposure of its frames."""
 
 
@@ -89,7 +76,7 @@ class FlatFieldJob(JobRequest):
     kind: Literal["calibrate-flat-field"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture that the images lie in and belong to."""
-    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, calibrate.IMAGES]
     """Names of the images in the capture's folder, of its resolution and encoding."""
     dark_images: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--dark", metavar="NAME")] = ()
     """Name of a dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
@@ -101,9 +88,9 @@ class WhiteBalanceJob(JobRequest):
     kind: Literal["calibrate-white-balance"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture that the images lie in and belong to."""
-    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, calibrate.IMAGES]
     """Names of the images of the card in the capture's folder, of its resolution and encoding."""
-    options: WhiteBalanceOptions = WhiteBalanceOptions()
+    options: calibrate.WhiteBalanceOptions = calibrate.WhiteBalanceOptions()
 
 
 class ChartJob(JobRequest):
@@ -132,11 +119,11 @@ class ProcamJob(JobRequest):
     calibration.json."""
 
     kind: Literal["calibrate-procam"]
-    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, calibrate.POSES]
     """The captures, one for each pose of the board."""
     apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture of the same rig, whose manifest is written too; may be repeated."""
-    options: ProcamOptions
+    options: calibrate.ProcamOptions
 
 
 class StereoCalibrationJob(JobRequest):
@@ -148,7 +135,7 @@ class StereoCalibrationJob(JobRequest):
     """The capture, each of whose stereo frames shows the board in another pose."""
     apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
-    options: BoardOptions
+    options: calibrate.BoardOptions
 
 
 class LaserPlanesJob(JobRequest):
@@ -156,11 +143,11 @@ class LaserPlanesJob(JobRequest):
     capture, calibration.json."""
 
     kind: Literal["calibrate-laser-planes"]
-    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, calibrate.POSES]
     """The captures, one for each pose of the board or step, the same laser frames in each; with a board also a frame without the laser."""
     apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
-    options: LaserPlanesOptions
+    options: calibrate.LaserPlanesOptions
 
 
 class ResponseJob(JobRequest):
@@ -169,9 +156,9 @@ class ResponseJob(JobRequest):
     kind: Literal["calibrate-response"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture: the images lie in its folder, its camera took them, its projector gets the response."""
-    images: Annotated[tuple[Line, ...], Field(min_length=LEAST_GREYS), Role.INPUT, IMAGES]
+    images: Annotated[tuple[Line, ...], Field(min_length=calibrate.LEAST_GREYS), Role.INPUT, calibrate.IMAGES]
     """Names of the images of evenly grey projections in the capture's folder."""
-    options: ResponseOptions = ResponseOptions()
+    options: calibrate.ResponseOptions = calibrate.ResponseOptions()
 
 
 class TofCalibrationJob(JobRequest):

@@ -10,21 +10,7 @@ import typer
 from service.cli.groups import make_group
 from service.cli.printing import print_table
 from service.cli.request_commands import product_command
-from service.requests.calibrate import (
-    DarkRequest,
-    FlatFieldRequest,
-    GreyBallRequest,
-    IntensityRequest,
-    LaserPlanesRequest,
-    LightPositionsRequest,
-    MirrorBallRequest,
-    ProcamRequest,
-    ResponseRequest,
-    SaturationRequest,
-    StereoRequest,
-    TofCalibrationRequest,
-    WhiteBalanceRequest,
-)
+from service.requests import calibrate
 from service.requests.chart import ChartRequest
 from service.requests.rig import RigCalibrationRequest
 
@@ -42,20 +28,20 @@ def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = make_group("calibrate",
                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
-    product_command(kinds, "mirror-ball", MirrorBallRequest, "service.calibrate.lights:mirror_ball", _print_lights)
-    product_command(kinds, "light-positions", LightPositionsRequest, "service.calibrate.lights:light_positions", _print_lights)
-    product_command(kinds, "grey-ball", GreyBallRequest, "service.calibrate.lights:grey_ball", _print_lights)
-    product_command(kinds, "intensity", IntensityRequest, "service.calibrate.lights:intensity", _print_lights)
-    product_command(kinds, "dark", DarkRequest, "service.calibrate.sensor:dark", partial(_print_image, "dark"))
-    product_command(kinds, "flat-field", FlatFieldRequest, "service.calibrate.sensor:flat_field", partial(_print_image, "flat"))
-    product_command(kinds, "saturation", SaturationRequest, "service.calibrate.sensor:saturation", _saturation)
-    product_command(kinds, "white-balance", WhiteBalanceRequest, "service.calibrate.sensor:white_balance", _white_balance)
+    product_command(kinds, "mirror-ball", calibrate.MirrorBallRequest, "service.calibrate.lights:mirror_ball", _print_lights)
+    product_command(kinds, "light-positions", calibrate.LightPositionsRequest, "service.calibrate.lights:light_positions", _print_lights)
+    product_command(kinds, "grey-ball", calibrate.GreyBallRequest, "service.calibrate.lights:grey_ball", _print_lights)
+    product_command(kinds, "intensity", calibrate.IntensityRequest, "service.calibrate.lights:intensity", _print_lights)
+    product_command(kinds, "dark", calibrate.DarkRequest, "service.calibrate.sensor:dark", partial(_print_image, "dark"))
+    product_command(kinds, "flat-field", calibrate.FlatFieldRequest, "service.calibrate.sensor:flat_field", partial(_print_image, "flat"))
+    product_command(kinds, "saturation", calibrate.SaturationRequest, "service.calibrate.sensor:saturation", _saturation)
+    product_command(kinds, "white-balance", calibrate.WhiteBalanceRequest, "service.calibrate.sensor:white_balance", _white_balance)
     product_command(kinds, "chart", ChartRequest, "service.calibrate.chart:calibrate_chart", _chart)
-    product_command(kinds, "procam", ProcamRequest, "service.calibrate.procam:procam", _procam)
-    product_command(kinds, "stereo", StereoRequest, "service.calibrate.stereo:stereo", _stereo)
-    product_command(kinds, "laser-planes", LaserPlanesRequest, "service.calibrate.laser_planes:laser_planes", _laser_planes)
-    product_command(kinds, "response", ResponseRequest, "service.calibrate.response:response", _response)
-    product_command(kinds, "tof", TofCalibrationRequest, "service.calibrate.tof:calibrate_tof", _tof)
+    product_command(kinds, "procam", calibrate.ProcamRequest, "service.calibrate.procam:procam", _procam)
+    product_command(kinds, "stereo", calibrate.StereoRequest, "service.calibrate.stereo:stereo", _stereo)
+    product_command(kinds, "laser-planes", calibrate.LaserPlanesRequest, "service.calibrate.laser_planes:laser_planes", _laser_planes)
+    product_command(kinds, "response", calibrate.ResponseRequest, "service.calibrate.response:response", _response)
+    product_command(kinds, "tof", calibrate.TofCalibrationRequest, "service.calibrate.tof:calibrate_tof", _tof)
     product_command(kinds, "rig", RigCalibrationRequest, "service.calibrate.rig_lamps:calibrate_rig", _rig)
     app.add_typer(kinds)
 
@@ -96,7 +82,7 @@ def _stereo(result: Any) -> None:
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
 
 
-def _laser_planes(result: Any, request: LaserPlanesRequest) -> None:
+def _laser_planes(result: Any, request: calibrate.LaserPlanesRequest) -> None:
     _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
 
