@@ -240,8 +240,8 @@ def extract(volume: Volume) -> Triangles:
     crossed, cases = (wp.empty(count, dtype=wp.uint8, device=device) for _ in range(2))
     vertices, faces = (wp.empty(count, dtype=int, device=device) for _ in range(2))
     devices.launch(_count_kernel, count, [voxels, triangles], [crossed, vertices, cases, faces], device=device)
-    vertex_start, vertex_count = _starts(vertices, device)
-    face_start, face_count = _starts(faces, device)
+    vertex_start, vertex_count = _starts(vertices)
+    face_start, face_count = _starts(faces)
     if face_count == 0:
         return none
     points = wp.empty(vertex_count, dtype=wp.vec3, device=device)
@@ -258,7 +258,7 @@ def extract(volume: Volume) -> Triangles:
     return Triangles(to_numpy(points)[used], to_numpy(sigma)[used], to_numpy(edge)[used], renumbered[corners].reshape(-1, 3))
 
 
-def _starts(counts: Any, device: str) -> tuple[Any, int]:
+def _starts(counts: Any) -> tuple[Any, int]:
     """Return the sums of the counts before each, in place, and the sum of all."""
     last = int(to_numpy(counts[-1:])[0])
     starts = wp.empty_like(counts)

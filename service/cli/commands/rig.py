@@ -8,28 +8,21 @@ from service.cli.groups import make_group
 from service.cli.printing import print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command, product_command
+from service.requests import rig as requests
 from service.requests.drive import DriveRequest
 from service.requests.play import PlayRequest, TwinRequest
-from service.requests.rig import (
-    RigCheckRequest,
-    RigFromCaptureRequest,
-    RigFromCsvRequest,
-    RigFromMvrRequest,
-    RigPlanRequest,
-    RigSweepRequest,
-)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     rig = make_group("rig", help="Rigs of driven lamps: check them, make them from captures, tables and scenes, plan them; docs/drive.md.")
     local_command(rig, "check", _check)
-    product_command(rig, "from-capture", RigFromCaptureRequest, "service.rigs.from_capture:rig_from_capture", _made)
-    product_command(rig, "from-csv", RigFromCsvRequest, "service.rigs.from_capture:rig_from_csv", _made)
-    product_command(rig, "from-mvr", RigFromMvrRequest, "service.rigs.from_mvr:rig_from_mvr",
+    product_command(rig, "from-capture", requests.RigFromCaptureRequest, "service.rigs.from_capture:rig_from_capture", _made)
+    product_command(rig, "from-csv", requests.RigFromCsvRequest, "service.rigs.from_capture:rig_from_csv", _made)
+    product_command(rig, "from-mvr", requests.RigFromMvrRequest, "service.rigs.from_mvr:rig_from_mvr",
                     lambda made, request: _made(made.rig, request))
-    product_command(rig, "sweep", RigSweepRequest, "service.rigs.sweep:sweep_rig", _sweep)
-    product_command(rig, "plan", RigPlanRequest, "service.rigs.dome_plan:plan_rig", _plan)
+    product_command(rig, "sweep", requests.RigSweepRequest, "service.rigs.sweep:sweep_rig", _sweep)
+    product_command(rig, "plan", requests.RigPlanRequest, "service.rigs.dome_plan:plan_rig", _plan)
     app.add_typer(rig)
     product_command(app, "drive", DriveRequest, "service.drive.drive:drive", _drive)
     local_command(app, "play", _play)
@@ -45,7 +38,7 @@ def _drive(result: Any) -> None:
           f"the largest of {result.frames} frames")
 
 
-def _check(request: RigCheckRequest) -> None:
+def _check(request: requests.RigCheckRequest) -> None:
     from service.errors import RequestError
     from service.rigs.check import check_rig
 
@@ -61,7 +54,7 @@ def _check(request: RigCheckRequest) -> None:
         raise RequestError("; ".join(f"{request.rig}: {fault}" for fault in found.faults))
 
 
-def _made(rig: Any, request: RigFromCaptureRequest | RigFromCsvRequest | RigFromMvrRequest) -> None:
+def _made(rig: Any, request: requests.RigFromCaptureRequest | requests.RigFromCsvRequest | requests.RigFromMvrRequest) -> None:
     print(f"rig      {request.out}: {len(rig.lights)} lamps")
 
 
@@ -70,7 +63,7 @@ def _sweep(made: Any) -> None:
     print(f"table    {made.table}")
 
 
-def _plan(found: Any, request: RigPlanRequest) -> None:
+def _plan(found: Any, request: requests.RigPlanRequest) -> None:
     print(f"table    {request.out / 'plan.csv'}")
     print(f"plot     {request.out / 'plan.png'}")
     rows, doubts = found

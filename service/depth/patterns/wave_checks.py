@@ -217,7 +217,7 @@ def _check_one(waves: Waves, sample: Sample, model: ProjectorModel | None, axis:
     mean = uniform_filter1d(phasor.real, AVERAGED, axis=1) + 1j * uniform_filter1d(phasor.imag, AVERAGED, axis=1)
     clear = waves.clear & (np.abs(mean) > ALIKE)
     turns = np.angle(mean) / (2 * np.pi) % 1.0
-    forward = _order(turns, clear, sample, model, axis)
+    forward = _order(turns, clear, model, axis)
     if forward is not None and forward < 1 - AGAINST:
         if model is not None:
             return ("run against the order in which camera and projector see one surface: their steps run backwards, or the projected "
@@ -258,7 +258,7 @@ def _last_that_fits(sign: int, state: Callable[[float], tuple[bool, float]]) -> 
     return 0.5
 
 
-def _order(turns: np.ndarray, clear: np.ndarray, sample: Sample, model: ProjectorModel | None, axis: int) -> float | None:
+def _order(turns: np.ndarray, clear: np.ndarray, model: ProjectorModel | None, axis: int) -> float | None:
     """Return the part of the runs along the image rows on which a wave runs in the order of the projector; None if too few tell."""
     if axis == 1:  # rows of a sample are too far apart to follow what changes down the image
         return None
