@@ -109,6 +109,8 @@ class Move(NamedTuple):
 
 
 STAY = Move(np.zeros(7), irradiance_holds=False)
+EVERY = slice(None)
+"""All pixels of the sample."""
 
 
 class _Search:
@@ -144,29 +146,27 @@ class _Search:
         """Return the normals under lights that are moved, and what they leave."""
         return surface_at(self.sample._replace(lamps=self.moved(move)), self._depth, DEVICE)
 
-    def best(self, counted: np.ndarray | None = None, *, turned: bool | None = None) -> Move:
-        """Return the move that leaves least.
-        `counted`: [pixels] bool, whose readings count; None: all. `turned`: whether the lights may be turned; None: only where a turn takes
-        clearly more away than moves."""
-        def searched(holds: bool, count: int) -> tuple[float, Move]:
+    def best(self) -> Move:
+        """Return the move that leaves least, with a turn only where that takes clearly more away than moves."""
+        (cost, move), (less, other) = (self.searched(turned=turned) for turned in (False, True))
+        gain = (cost - less) / (cost + QUIET)
+        clear = gain > LEAST_GAIN and other.turn.right.magnitude() > (LEAST_TURN if gain > CLEAR_GAIN else LEAST_TURN_UNCLEAR)
+        return other if clear else move
+
+    def searched(self, counted: np.ndarray | slice = EVERY, *, turned: bool) -> tuple[float, Move]:
+        """Return the mean cost and the move that leaves least, with a turn or without. `counted`: [pixels] bool, whose readings count."""
+        count = 7 if turned else 4
+
+        def found(holds: bool) -> tuple[float, Move]:
             def cost(values: np.ndarray) -> float:
-                move = Move(np.pad(values, (0, 7 - count)), holds)
-                return float(cost_of(self.fit(move))[slice(None) if counted is None else counted].mean())
+                return float(cost_of(self.fit(Move(np.pad(values, (0, 7 - count)), holds)))[counted].mean())
 
-            found = minimize(cost, np.zeros(count), method="Nelder-Mead", options={
-                "initial_simplex": np.vstack([np.zeros(count), np.diag([STEP] * 4 + [ANGLE] * 3)[:count, :count]]), "adaptive": count > 4,
-                "maxfev": MOST_FITS if count == 4 else MOST_FITS_TURNED, "xatol": LENGTH, "fatol": COST})
-            return float(found.fun), Move(np.pad(found.x, (0, 7 - count)), holds)
+            best = minimize(cost, np.zeros(count), method="Nelder-Mead", options={
+                "initial_simplex": np.vstack([np.zeros(count), np.diag([STEP] * 4 + [ANGLE] * 3)[:count, :count]]), "adaptive": turned,
+                "maxfev": MOST_FITS_TURNED if turned else MOST_FITS, "xatol": LENGTH, "fatol": COST})
+            return float(best.fun), Move(np.pad(best.x, (0, 7 - count)), holds)
 
-        if turned:
-            return searched(False, 7)[1]
-        cost, move = min((searched(holds, 4) for holds in (False, True)), key=lambda one: one[0])
-        if turned is None:
-            less, other = searched(False, 7)
-            gain = (cost - less) / (cost + QUIET)
-            if gain > LEAST_GAIN and other.turn.right.magnitude() > (LEAST_TURN if gain > CLEAR_GAIN else LEAST_TURN_UNCLEAR):
-                return other
-        return move
+        return min((found(holds) for holds in ((False,) if turned else (False, True))), key=lambda one: one[0])
 
     def facts(self, move: Move) -> dict[str, Any]:
         """Return a move as the report has it."""
@@ -228,7 +228,7 @@ def refine_places(given: SolveInput, lights: PlacedLights) -> RefinedPlaces:
     square = squares_of(search.sample.mask)
     even = (square // SQUARES + square) % 2 == 0  # as on a chessboard
     # twice what noise leaves, for what both halves share
-    left = degrees_between(*(search.fit(search.best(own, turned=found.is_turned)).normal for own in (even, ~even)))
+    left = degrees_between(*(search.fit(search.searched(own, turned=found.is_turned)[1]).normal for own in (even, ~even)))
     lamps = search.moved(found)
     ratio = lamps.strength / search.sample.lamps.strength
     if not found.irradiance_holds:  # then as strong at the origin as before, on the whole
