@@ -46,7 +46,7 @@ LARGEST = 1.0e15
 
 
 def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
-                extent: float, stripe_px: float = 1.0, crosstalk: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
+                extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
     """Decode a base-k code in grey levels or colours to stripe centres; not synchronised on CUDA.
 
     SATURATED: a frame of the code is. SHADOWED: white is not above black. UNDECIDED: doubtful digits leave stripes apart. OUT_OF_RANGE: a
@@ -56,18 +56,17 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
         frames: linear images: one channel for levels, three for colours.
         digits: frame of each digit, digit 0 (the finest) first.
         white, black: frames of the projector full on and black.
-        levels: [k] grey levels or [k, 3] colours of the digit values, 0…1, linear light.
+        levels: [k] grey levels or [k, 3] colours of the digit values as the camera sees them, 0…1, linear light.
         reflected: whether the code is the reflected one.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
-        crosstalk: [3, 3] camera channels from projector channels, for colours; None: each channel sees its own.
 
     Raises:
         ArrayError: a frame is missing, does not exist or is given twice; levels that are the same; a value that cannot be.
     """
     check_noise(noise)
     check_stripes(extent, stripe_px)
-    expected = expected_levels(levels, crosstalk)
+    expected = expected_levels(levels)
     base, channels = expected.shape
     require_frames(frames, *digits, white, black, channels=channels)
     if not digits or base ** len(digits) * stripe_px < extent:
@@ -90,8 +89,9 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
     return result
 
 
-def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndarray:
+def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None = None) -> np.ndarray:
     """Return the reading of each digit value, as a part of white minus black, [k, channels] float64.
+    `crosstalk`: [3, 3] camera channels from projector channels, for colours; None: each channel sees its own.
     Raises ArrayError: shapes that cannot be, or levels that look the same."""
     given = np.asarray(levels, dtype=np.float64)
     if given.ndim == 1:
