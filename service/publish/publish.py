@@ -1,19 +1,21 @@
 """Publish a capture as a folder of static files, whole or not at all."""
 
 import json
+from html import escape
+from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from service import __version__
-from service.basis.capture import display_of, open_capture, stored_sample
+from service.basis.capture import BasisCapture, display_of, open_capture, stored_sample
 from service.errors import RequestError
-from service.publish.annotations import read_annotations
+from service.publish.annotations import Annotation, read_annotations
 from service.publish.iiif import MANIFEST_FILE, write_iiif
 from service.publish.planes import INFO_FILE, write_planes
-from service.publish.web import PAGE_FILE, write_page
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, other_inputs
 from service.requests.publish import PublishedAs, PublishRequest
@@ -26,6 +28,7 @@ from stage.results.maps import SurfaceMaps
 
 PUBLICATION_FILE, SCHEMA = "publication.json", "relit.publication/1"
 """The file by which a folder is known as one that this command has made."""
+PAGE_FILE = "index.html"
 LEAST_LIGHTS = 3
 
 
@@ -79,7 +82,7 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
             loss = write_planes(folder, source, display, sample, device, timings, quality=request.quality,
                                 whole=request.kind is PublishedAs.OPENLIME)
             if request.kind is PublishedAs.WEB:
-                write_page(folder, source, request, annotations)
+                _write_page(folder, source, request, annotations)
         write_text(folder / PUBLICATION_FILE, json.dumps({
             "schema": SCHEMA, "as": request.kind, "version": __version__, "provenance": source.provenance,
             "entries": sorted(path.name for path in folder.iterdir())}, indent=1) + "\n")
@@ -88,6 +91,18 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
     first = {PublishedAs.IIIF: MANIFEST_FILE, PublishedAs.OPENLIME: INFO_FILE, PublishedAs.WEB: PAGE_FILE}[request.kind]
     return PublishResult(request.out / first, len(sizes), sum(sizes), source.near, source.stack.light_count - len(front),
                          loss, (*source.warnings, *(() if doubt is None else (doubt,))))
+
+
+def _write_page(folder: Path, source: BasisCapture, request: PublishRequest, annotations: list[Annotation]) -> None:
+    """Write the page that lights the planes beside it live: static files that need no server but one that serves files."""
+    title = request.title or source.capture.name
+    for file in files("service.publish").joinpath("static").iterdir():
+        text = file.read_text(encoding="utf-8")
+        if file.name == PAGE_FILE:
+            text = Template(text).substitute(title=escape(title), attribution=escape(request.attribution or ""))
+        write_text(folder / file.name, text)
+    scene = {"schema": "relit.scene/1", "title": title, "notes": [note._asdict() for note in annotations]}
+    write_text(folder / "scene.json", json.dumps(scene) + "\n")
 
 
 def _with_capture(request: PublishRequest) -> PublishRequest:
