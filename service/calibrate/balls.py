@@ -9,7 +9,7 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from service.calibrate.results import LightCaptures, digits
 from service.calibrate.solvers.apply import LitFrame, as_direction
-from service.calibrate.solvers.ball_search import OVAL_ERROR, find_outlines, outline_near
+from service.calibrate.solvers.ball_search import find_outlines, outline_near
 from service.calibrate.solvers.mirror_ball import find_spot, still_light
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, fit_circle, project, view_ball
@@ -29,6 +29,9 @@ RADIUS_TOLERANCE = 0.05
 """Relative difference of a ball's radius in metres from its radius in pixels × pixel_size_m, above which one of them must be wrong."""
 FRAMES = 16
 """The most frames in which each outline is looked at."""
+SPANS, LEAST_SPAN = 4, 2
+"""In how many runs of these frames a ball is looked for to tell whether it moved, and the least frames of one: twelve right lights move it
+by .8 px at most."""
 CANDIDATES = 12
 """The most outlines that are looked at."""
 WHITE = 0.995
@@ -80,7 +83,7 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
     names = [*(f"--ball {circle.u:g},{circle.v:g},{circle.radius_px:g}" for circle in request.circles),
              *(f"--ball-mask {path}" for path in request.masks)]
     camera = captures.source.camera
-    pictures = _pictures(captures, Correction.of(captures.source), FRAMES)
+    pictures = _pictures(captures, Correction.of(captures.source), evenly(len(captures.lit), FRAMES))
     result, said = [], []
     for name, ball in zip(names, balls, strict=True):
         outline = outline_near(camera, pictures, ball) or next((one for one in find_outlines(camera, pictures) if _overlap(
@@ -88,8 +91,8 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
         if outline is not None:
             named, seen = ((*project(camera, each.centre), each.radius_px) for each in (ball, outline.ball))
             aside = float(np.linalg.norm(np.subtract(named, seen)))
-            ball = ball._replace(outline_error_px=float(np.linalg.norm([ball.outline_error_px, aside, OVAL_ERROR * outline.oval_px])),
-                                 oval_px=outline.oval_px)
+            ball = ball._replace(outline_error_px=float(np.linalg.norm([ball.outline_error_px, aside, outline.ball.bent_px])),
+                                 oval_px=outline.ball.oval_px, off_axis_degrees=outline.ball.off_axis_degrees)
             if aside > ASIDE_PX:
                 (u, v), radius = fit_circle(outline.points)
                 said.append(f"{name}: lies {aside:.1f} px from the outline that the images show there, {u:.1f},{v:.1f},{radius:.1f}: what "
@@ -98,12 +101,33 @@ def compared(request: BallRequest, balls: Sequence[Ball], captures: LightCapture
     return result, said
 
 
-def oval_sentences(balls: Sequence[Ball]) -> list[str]:
-    """Return a sentence for each ball whose outline is an ellipse."""
-    return [f"the ball of {ball.radius_px:.0f} px: its outline is an ellipse, {200 * ball.oval_px / ball.radius_px:.0f} % longer than "
-            "wide, as where images were resized in one direction, or a perspective camera is declared orthographic: what is measured is "
-            "as much less sure; give images with square pixels, and camera.projection, focal_px and principal_px"
-            for ball in balls if ball.oval_px]
+def examined(captures: LightCaptures, balls: Sequence[Ball]) -> tuple[list[Ball], list[str]]:
+    """Compare where balls lie in the course of a capture. Returns them, as far off as they moved, and a sentence for each that moved or
+    whose outline is an ellipse."""
+    camera, correction = captures.source.camera, Correction.of(captures.source)
+    spans = [span for span in np.array_split(evenly(len(captures.lit), FRAMES), SPANS) if len(span) >= LEAST_SPAN]
+    pictures = [_pictures(captures, correction, span) for span in spans]
+    result, said = [], []
+    for ball in balls:
+        places = [None if seen is None else seen.middle for seen in (outline_near(camera, shown, ball) for shown in pictures)]
+        pairs = [(float(np.linalg.norm(one - other)), number, before) for number, one in enumerate(places) if one is not None
+                 for before, other in enumerate(places[:number]) if other is not None]
+        moved, later, earlier = max(pairs, default=(0.0, 0, 0))
+        if moved > ASIDE_PX:
+            ball = ball._replace(outline_error_px=float(np.hypot(ball.outline_error_px, moved)))
+            here, there = (" to ".join(captures.lit[span[end]].frame.image for end in (0, -1)) for span in (spans[later], spans[earlier]))
+            said.append(f"frames: the ball of {ball.radius_px:.0f} px lies {moved:.1f} px aside from {here} of where it lies from {there}: "
+                        "it or the camera moved: what is measured is as much less sure; calibrate the frames before and after that "
+                        "apart, or take them again")
+        if ball.oval_px:
+            cause, mend = ((f" towards the image centre, as a perspective camera sees it {ball.off_axis_degrees:.0f}° off its axis", "")
+                           if ball.off_axis_degrees else (", as where images were resized in one direction, or a perspective camera is "
+                                                          "declared orthographic", "images with square pixels, and "))
+            longer = 200 * ball.oval_px / ball.radius_px
+            said.append(f"the ball of {ball.radius_px:.0f} px: its outline is an ellipse, {longer:.0f} % longer than wide{cause}: what is "
+                        f"measured is as much less sure; give {mend}camera.projection, focal_px and principal_px")
+        result.append(ball)
+    return result, said
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
@@ -213,7 +237,7 @@ def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float |
 def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
           z_m: float | None) -> _Found:
     camera, correction = captures.source.camera, Correction.of(captures.source)
-    pictures = _pictures(captures, correction, len(captures.lit))
+    pictures = _pictures(captures, correction, range(len(captures.lit)))
     brightest = pictures[1]
     outlines = find_outlines(camera, pictures)[:CANDIDATES]
     placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
@@ -243,11 +267,10 @@ def _seen_in(captures: LightCaptures, correction: Correction, views: Sequence[Ba
     return seen
 
 
-def _pictures(captures: LightCaptures, correction: Correction, most: int) -> list[np.ndarray]:
-    """Return the mean and the brightest of frames, [rows, cols] 0 to 1, as outlines are looked for. `most`: how many frames, at most."""
+def _pictures(captures: LightCaptures, correction: Correction, chosen: Sequence[int] | np.ndarray) -> list[np.ndarray]:
+    """Return the mean and the brightest of frames, [rows, cols] 0 to 1, as outlines are looked for. `chosen`: the numbers of the frames."""
     camera = captures.source.camera
     mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
-    chosen = evenly(len(captures.lit), most)
     for number in chosen:
         grey = correction.apply(captures.lit[number].frame).pixels.mean(axis=-1, dtype=np.float64)
         shown = np.clip(grey / max(float(np.quantile(grey, WHITE)), 1e-12), 0, 1) ** GAMMA

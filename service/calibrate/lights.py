@@ -12,10 +12,10 @@ from service.calibrate.balls import (
     balls_of,
     check_metric,
     compared,
+    examined,
     find_grey_ball,
     find_mirror_ball,
     find_mirror_balls,
-    oval_sentences,
     still_on,
 )
 from service.calibrate.light_faults import (
@@ -82,7 +82,8 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
         (ball,), warnings = compared(request, balls_of(request, captures.source.camera, exactly=1), captures)
     else:
         ball = find_mirror_ball(captures, request.level)
-    warnings += oval_sentences([ball])
+    (ball,), said = examined(captures, [ball])
+    warnings += said
     view = view_ball(ball, captures.source.camera)
     # what is not measured stays as the target has it
     targets = _targets(captures)
@@ -114,7 +115,8 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
              else _balls_in_sight(request, captures))
     check_metric(captures.source, balls, request.ball_radius_m)
     balls, warnings = compared(request, balls, captures) if named else (balls, [])
-    warnings += oval_sentences(balls)
+    balls, said = examined(captures, balls)
+    warnings += said
     views = [view_ball(ball, camera) for ball in balls]
     middle = np.mean([ball.centre for ball in balls], axis=0)
     targets = _targets(captures)
@@ -173,7 +175,8 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     else:
         level = camera.surface_z_m if camera.projection == "orthographic" else None
         ball = find_grey_ball(captures, request.ball_radius_m, level if request.ball_z_m is None else request.ball_z_m)
-    warnings += oval_sentences([ball])
+    (ball,), said = examined(captures, [ball])
+    warnings += said
     near = next((lit for lit in captures.lit if isinstance(lit.light, PointLight)), None)
     if near is not None:
         where = f"{captures.source.folder / FILE_NAME}: frames[{near.number}].light: is point"

@@ -46,6 +46,13 @@ class Ball(NamedTuple):
     """The standard error of the centre of the outline in pixels."""
     oval_px: float = 0.0
     """How much farther from the centre than the mean the ends of its outline are, where this is an ellipse and that of no ball."""
+    off_axis_degrees: float = 0.0
+    """How far off its axis a perspective camera saw the ball, whose outline says so while the camera is declared orthographic."""
+
+    @property
+    def bent_px(self) -> float:
+        """The error of the centre that stands for what an ellipse, or a view from aside, does to directions."""
+        return max(self.oval_px, math.radians(self.off_axis_degrees) / 2 * self.radius_px)
 
 
 class BallView(NamedTuple):

@@ -49,11 +49,15 @@ STEPS, CLEAR = 3, 4.0
 TRIPLES, NEAR_PX = 1000, 1.5
 """Circles of RANSAC, of which one in a million misses where a quarter of the points lies on one, and the largest distance of a point near a
 circle: a pixel, and what the ellipse of a perspective camera differs from one."""
-LEAST_OVAL, LEAST_OVAL_PX, MORE, ROUNDS = 0.02, 1.0, 0.1, 10
-"""The least part of the radius, and pixels, by which the ends of an ellipse are farther out, from which on it is none of a ball; the part
-of the radii by which it must have more than the circle has; and the rounds in which it is found from that."""
-OVAL_ERROR = 2.0
-"""The error of the centre of a circle in an ellipse over what the ends of that are farther out."""
+LEAST_OVAL, LEAST_OVAL_PX, MOST_OVAL, MORE = 0.02, 1.0, 0.15, 0.1
+"""The least part of the radius, and pixels, by which the ends of an ellipse are farther out, from which on it is none of a ball; the most
+that is looked for; and the part of the radii by which it must have more than the circle has."""
+RADIAL, RADIAL_PX, RADIAL_DEGREES, RADIAL_SHARE, SHORTEST = 0.01, 0.5, 15.0, 0.6, 0.6
+"""The same two limits of an ellipse whose longer axis points to the image centre within this angle, as a perspective camera sees a ball,
+with this part of the radii on it, and the least focal length over the width of the image: what stands around a mirror draws its outline out
+by .35 px at most, mostly upright."""
+LEAST_DETERMINANT = 1e-3
+"""Five steps of brightness with a smaller determinant of their waves tell no ellipse."""
 SAME = 0.08
 """Circles whose centres and radii differ by less than this part of the radius are one."""
 
@@ -67,12 +71,16 @@ class RoundOutline(NamedTuple):
     """The part of the radii with a point on the outline."""
     error_px: float
     """The standard error of the centre."""
-    oval_px: float
-    """As of the ball."""
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The centre, [2] u, v, of the circle through the points."""
+        return fit_circle(self.points)[0]
 
     def place(self, camera: Camera, radius_m: float | None, z_m: float | None) -> Ball:
         """Return the ball with what is known of its size and place."""
-        return ball_from_outline(camera, self.points, error_px=self.error_px, radius_m=radius_m, z_m=z_m)._replace(oval_px=self.oval_px)
+        placed = ball_from_outline(camera, self.points, error_px=self.error_px, radius_m=radius_m, z_m=z_m)
+        return placed._replace(oval_px=self.ball.oval_px, off_axis_degrees=self.ball.off_axis_degrees)
 
 
 def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutline]:
@@ -150,25 +158,49 @@ def _outline_about(camera: Camera, blurred: list[np.ndarray], u: float, v: float
         points = np.stack([u + distance * np.cos(turn[ray, 0]), v + distance * np.sin(turn[ray, 0])], axis=1)
         try:
             ball, inside, error_px = refine_outline(camera, points, _on_a_circle(points, ray))
+            waves = np.stack([np.ones(len(ray)), *(wave(times * turn[ray, 0]) for times in (1, 2) for wave in (np.cos, np.sin))], axis=1)
+            oval, near = _ellipse(distance_px(ball, camera, points), waves, ray, ball.radius_px)
+            radial = _off_axis(camera, ball, oval, len(np.unique(ray[near])) / RAYS)
+            more = len(np.unique(ray[near])) - len(np.unique(ray[inside])) >= MORE * RAYS
+            oval_px = float(np.hypot(*oval)) if radial or more else 0.0
+            if oval_px >= max(LEAST_OVAL_PX, LEAST_OVAL * ball.radius_px):
+                ball, inside = ball_from_outline(camera, points[near], error_px=error_px), near
+            elif not radial:
+                oval_px = 0.0
         except CalibrationError:
             continue
         share = len(np.unique(ray[inside])) / RAYS
         if share >= LEAST_SHARE and (best is None or share > best.share):
-            oval = _oval_px(distance_px(ball, camera, points), turn[ray, 0], ray, inside, ball.radius_px)
-            best = RoundOutline(points[inside], ball, share, math.hypot(max(error_px, ERROR_PX / share), OVAL_ERROR * oval), oval)
+            ball = ball._replace(oval_px=oval_px, off_axis_degrees=radial)
+            best = RoundOutline(points[inside], ball, share, math.hypot(max(error_px, ERROR_PX / share), ball.bent_px))
     return best
 
 
-def _oval_px(away: np.ndarray, angle: np.ndarray, ray: np.ndarray, inside: np.ndarray, radius: float) -> float:
-    """Return how much farther out the ends of the ellipse are which steps of brightness lie on rather than on a circle; else 0.
-    `away`: [steps] their distances from the circle. `angle`, `ray`: [steps] about its centre. `inside`: [steps] bool, those on it."""
-    waves, near = np.stack([np.ones_like(angle), *(wave(times * angle) for times in (1, 2) for wave in (np.cos, np.sin))], axis=1), inside
-    for _ in range(ROUNDS):
-        fit = np.linalg.lstsq(waves[near], away[near])[0]
-        near = np.abs(away - waves @ fit) < NEAR_PX
-    oval = float(np.hypot(*fit[3:]))
-    more = len(np.unique(ray[near])) - len(np.unique(ray[inside])) >= MORE * RAYS
-    return oval if more and oval >= max(LEAST_OVAL_PX, LEAST_OVAL * radius) else 0.0
+def _ellipse(away: np.ndarray, waves: np.ndarray, ray: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ellipse near a circle on which steps of brightness of most radii lie: the waves by which it is farther out, [2] cosine and
+    sine of twice the angle, and which steps lie on it, [steps] bool.
+    `away`: [steps] their distances from the circle. `waves`: [steps, 5] 1, and cosines and sines of their angle and of twice it."""
+    chosen = np.random.default_rng(0).integers(0, len(away), (TRIPLES, 5))
+    chosen = chosen[np.abs(np.linalg.det(waves[chosen])) > LEAST_DETERMINANT]
+    fits = np.linalg.solve(waves[chosen], away[chosen][..., None])[..., 0]
+    near = np.abs(away - fits @ waves.T) < NEAR_PX
+    rays = np.logical_or.reduceat(near, np.flatnonzero(np.diff(ray, prepend=-1)), axis=1).sum(axis=1)
+    best = near[(rays * (np.hypot(*fits[:, 3:].T) < MOST_OVAL * radius)).argmax()]
+    fit = np.linalg.lstsq(waves[best], away[best])[0]
+    return fit[3:], best
+
+
+def _off_axis(camera: Camera, ball: Ball, oval: np.ndarray, share: float) -> float:
+    """Return how many degrees off its axis a perspective camera saw a ball whose outline is longer towards the image centre, as one that is
+    declared orthographic does not; else 0. `oval`: as `_ellipse` returns it. `share`: of the radii with a point on it."""
+    size = float(np.hypot(*oval))
+    way = np.subtract(project(camera, ball.centre), camera.principal_point)
+    turned = abs(math.remainder(math.atan2(oval[1], oval[0]) / 2 - math.atan2(way[1], way[0]), math.pi))
+    off_axis = math.acos((ball.radius_px - size) / (ball.radius_px + size))
+    seen = (camera.projection == "orthographic" and share >= RADIAL_SHARE and turned <= math.radians(RADIAL_DEGREES)
+            and size >= max(RADIAL_PX, RADIAL * ball.radius_px)
+            and float(np.hypot(*way)) >= SHORTEST * camera.width * math.tan(off_axis))
+    return math.degrees(off_axis) if seen else 0.0
 
 
 def _steps(slope: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -45,8 +45,9 @@ def room(number, seed=0):
     return np.where((cols - 255) ** 2 + (rows - 180) ** 2 < 9, 3.0, values)
 
 
-def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005, widened=1.0):
-    """The capture of a ball in the room, a book before its lower right side where `hidden`, in images that were widened by a factor."""
+def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005, widened=1.0, moved_px=0, declared=None):
+    """The capture of a ball in the room, a book before its lower right side where `hidden`, in images that were widened by a factor, and
+    the last third of them shifted; `declared`: another camera in the manifest."""
     lens, place = CAMERAS[camera]
     random, images = np.random.default_rng(3), []
     for number, direction in enumerate(DIRECTIONS):
@@ -56,8 +57,10 @@ def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005
         if hidden:
             rows, cols = np.mgrid[:HEIGHT, :WIDTH]
             values = np.where((cols > 130) & (rows > 145), 0.15 + 0.02 * (cols % 7), values)
+        values = np.roll(values, moved_px, axis=1) if 3 * number >= 2 * len(DIRECTIONS) else values
         images.append(cv2.resize(np.maximum(values + noise * random.normal(size=values.shape), 0), None, fx=widened, fy=1.0))
-    return write_lit(folder, images, [PLACEHOLDER] * len(images), camera={"resolution": list(images[0].shape[::-1]), **lens})
+    camera = {"resolution": list(images[0].shape[::-1]), **(declared or lens)}
+    return write_lit(folder, images, [PLACEHOLDER] * len(images), camera=camera)
 
 
 def measured(folder):
@@ -188,3 +191,16 @@ def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp
     relit.done("calibrate", f"{kind}-ball", folder, "--ball", f"{u},{v},{radius}", *(["--refine-direction"] if kind == "grey" else []))
     assert angles_degrees(measured(folder), DIRECTIONS).mean() < 0.25 * error.mean()
     assert json.loads((folder / "calibration.json").read_text())[f"{kind}-ball"]["warnings"] == []
+
+
+@pytest.mark.parametrize(("changes", "sentence"), [
+    ({"moved_px": 4}, "px aside from 009.exr to 011.exr of where it lies from 000.exr to 002.exr"),
+    pytest.param({"camera": "perspective", "declared": {"projection": "orthographic"}}, "as a perspective camera sees it 13° off its axis",
+                 marks=pytest.mark.long)])
+def test_a_ball_that_moved_or_is_seen_from_aside_is_said_and_held(relit, tmp_path, changes, sentence):
+    folder = photograph(tmp_path / "capture", **{"camera": "orthographic", **changes}, shade_of=chrome)
+    outcome = relit.done("calibrate", "mirror-ball", folder)
+    report = json.loads((folder / "calibration.json").read_text())["mirror-ball"]
+    error = angles_degrees(measured(folder), DIRECTIONS)
+    assert sentence in outcome.out.replace("\n", " ") and len(report["warnings"]) == 1
+    assert error.max() > 5 and (error / [light["uncertainty_degrees"] for light in report["lights"]]).max() < 1.5
