@@ -79,6 +79,8 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
                           "declare the same irradiance for every light",
         Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
                         "belongs to which image",
+        Cause.TEXT: f"frames[].light: images and lights look sorted otherwise, one of them by their numbers as text (1, 10, 11, 2): sorted "
+                    f"alike, {fits}; check which light belongs to which image, as by numbers of as many digits (01, 02)",
         Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
                        "light belongs to which image",
         Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "

@@ -84,6 +84,7 @@ class Cause(Enum):
     STEP = "the brightness of the images changes between two of them"
     NORMALISED = "the images are divided by the irradiance already"
     REVERSED = "the lights are in reverse order"
+    TEXT = "the lights are in the order of their numbers as text, or the images are"
     SHIFTED = "the lights are one frame off"
     DIRECTIONS = "directions and images do not belong together"
     STEADY = "light is on in all images that is not that of their lamps"
@@ -190,11 +191,14 @@ def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
 
 
 def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return the reverse order of the lights, or one that is a frame off, from an image on if not everywhere, if it explains the images."""
+    """Return the reverse order of the lights, that of text, or one that is a frame off, from an image on if not everywhere, if it explains
+    the images."""
     if misfit < LEAST_ORDER:
         return None
     numbers, found = np.arange(len(sample.directions)), []
-    for cause, order in ((Cause.REVERSED, numbers[::-1]), (Cause.SHIFTED, np.roll(numbers, 1)), (Cause.SHIFTED, np.roll(numbers, -1))):
+    texts = [np.array(sorted(numbers, key=lambda number: str(number + first))) for first in (0, 1)]
+    for cause, order in ((Cause.REVERSED, numbers[::-1]), (Cause.SHIFTED, np.roll(numbers, 1)), (Cause.SHIFTED, np.roll(numbers, -1)),
+                         *((Cause.TEXT, order) for text in texts for order in (text, np.argsort(text)) if (text != numbers).any())):
         fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
         if _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))

@@ -83,7 +83,8 @@ class Capture:
         headers = capture._check_files()
         capture = capture._exposed(headers)
         capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_encodings(headers),
-                                           *capture._other_pixels(headers), *other_sizes(capture.manifest), *capture.manifest.assumed))
+                                           *capture._other_pixels(headers), *capture._other_depths(headers),
+                                           *other_sizes(capture.manifest), *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -256,6 +257,13 @@ class Capture:
         return [f"pixelAspectRatio: is {headers[others[0]].pixel_aspect:.4g} in {len(others)} of the {len(headers)} images, {others[0]} "
                 f"the first of them, and {focal_y / focal_x:.4g} of the camera (focal_px): images are read by the camera; scale them to "
                 "square pixels, or declare focal_px"] if others else []
+
+    def _other_depths(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where images of eight bits, which mostly are sRGB, lie among others, which mostly are linear."""
+        few = sorted(name for name, header in headers.items() if header.eight_bits)
+        return [f"frames[].image: {len(few)} of the {len(headers)} images, {few[0]} the first of them, have 8 bits and the others more, as "
+                f"where previews lie beside their originals: all are read as {self.manifest.color_space}; give images of one kind"
+                ] if 0 < len(few) < len(headers) else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""

@@ -40,6 +40,7 @@ class ImageHeader(NamedTuple):
     encoding: str = ""  # what a Radiance file says of values that are not linear ones of Rec.709
     space: str = ""  # the colour space that an EXR file declares; empty where it declares none
     pixel_aspect: float = 1.0  # the width of a pixel over its height, as an EXR file declares
+    eight_bits: bool = False  # whether the file holds integers of eight bits
 
 
 class Decoder(Protocol):
@@ -107,7 +108,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
         stated = ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                              spec.format.basetype not in FLOATING, orientation, _exposure(spec))
+                              spec.format.basetype not in FLOATING, orientation, _exposure(spec), eight_bits=spec.format == oiio.UINT8)
     if suffix == ".hdr":
         return stated._replace(multiplied=radiance_multiplier(source.file), encoding=radiance_encoding(source.file))
     return stated

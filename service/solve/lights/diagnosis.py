@@ -80,7 +80,7 @@ class _Trial(NamedTuple):
     least_gain: float = LEAST_GAIN
 
 
-UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)
+UNORDERED = (Cause.REVERSED, Cause.TEXT, Cause.SHIFTED, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
 REPAIRED = "; the solve has used the brightness that the images ask for (found.light_intensities)"
 FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].light.position_m",

@@ -105,6 +105,16 @@ def test_a_picture_that_was_lost_or_taken_twice_is_named_with_its_place(first, b
         assert f"frames[].light: from {first:03d}.exr on, the images look {words}" in explanation_sentence(found, sample)
 
 
+@pytest.mark.parametrize("table", [False, True])
+def test_lights_or_images_in_the_order_of_their_numbers_as_text_are_named(table):
+    """1, 10, 11 … 2, 20 …, as programs sort names whose numbers have no leading zeros."""
+    readings, lights = ball(0.05)
+    text = np.array(sorted(range(24), key=lambda number: str(number + 1)))
+    sample = sample_of(readings if table else readings[text], lights[text] if table else lights)
+    found = better_explanation(sample, fit_manifest(sample))
+    assert found.cause is Cause.TEXT and "by their numbers as text" in explanation_sentence(found, sample)
+
+
 @pytest.mark.parametrize(("count", "room", "window"), [(8, 0.3, 0.5), (8, 0.15, 0.0), (24, 0.3, 0.8)])
 def test_light_of_the_room_is_told_by_what_lamps_do_not_reach(count, room, window):
     """A glossy ball under 8 to 24 lights, in a room that gives a part of a lamp's light, from above more than from below. Rough sheen,

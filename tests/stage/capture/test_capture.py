@@ -59,6 +59,16 @@ def test_encodings_that_files_declare_are_said(tmp_path):
     assert doubt.startswith("0.hdr: its header says GAMMA=2.2, and so do those of 4 of 4 images")
 
 
+def test_images_of_eight_bits_among_others_are_named(tmp_path):
+    """Previews or JPEG files beside linear originals: nothing could be solved, and nothing said why."""
+    write_capture(tmp_path, SCENE)
+    frames = manifest_of(SCENE)["frames"]
+    frames[2]["image"] = write_image(tmp_path / "002.png", np.zeros((*SCENE.images[0].shape[:2], 3), dtype=np.uint8)).name
+    edit_manifest(tmp_path, frames=frames)
+    doubt, = Capture.open(tmp_path).doubts
+    assert "1 of the 4 images, 002.png the first of them, have 8 bits and the others more" in doubt
+
+
 def test_pixels_of_another_shape_than_the_camera_are_named(tmp_path):
     """Anamorphic images, which were read as if their pixels were square; a camera whose focal lengths say the shape has no doubt."""
     write_capture(tmp_path, SCENE)
