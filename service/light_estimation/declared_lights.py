@@ -84,7 +84,7 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
         Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
                        "light belongs to which image",
         Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
-                          "check which light belongs to which image, and the directions",
+                          "check which light belongs to which image, the directions, and that all have one exposure (camera on manual)",
         Cause.STEADY: f"frames: the images look to share light that is not that of their lamps, {100 * found.part:.0f} % of what a lamp "
                       f"gives that a pixel faces, as light of the room or a black level: without it, {fits}; add an image with all lamps "
                       "off as a frame of light off, or give dark",
