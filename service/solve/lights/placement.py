@@ -146,6 +146,14 @@ class _Search:
         """Return the normals under lights that are moved, and what they leave."""
         return surface_at(self.sample._replace(lamps=self.moved(move)), self._depth, DEVICE)
 
+    def fit_without_falloff(self) -> NearFit:
+        """Return the normals where images are divided by the falloff of each light on the plane of the surface, and what they leave."""
+        lamps, mask = self.sample.lamps, self.sample.mask
+        plane = self.sample.points(np.full(mask.shape, self.sample.top - self._depth))[mask]
+        squares = ((lamps.place[:, None, :3] - plane) ** 2).sum(axis=2)
+        taken = np.where(self.near[:, None], squares / squares.mean(axis=1, keepdims=True), 1)
+        return surface_at(self.sample._replace(readings=self.sample.readings / taken), self._depth, DEVICE)
+
     def best(self) -> Move:
         """Return the move that leaves least, with a turn only where that takes clearly more away than moves."""
         (cost, move), (less, other) = (self.searched(turned=turned) for turned in (False, True))
@@ -204,6 +212,14 @@ def find_placement(given: SolveInput, lights: PlacedLights) -> Placement | None:
     less = np.bincount(squares_of(search.sample.mask), weights=before - after)
     if not found.plausible or np.median(after) > EXPLAINED or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
         return None
+    level = search.fit_without_falloff()
+    if cost_of(level).mean() < after.mean():
+        left = float(cost_of(level).mean() / (before.mean() + QUIET))
+        return Placement(
+            "frames[].light: the images look as if the falloff of near lights (1/r²) was taken out of them already, as by flat fields or a "
+            f"correction: without it the readings cost {100 * (1 - left):.0f} % less, more than with moved lights; give images as the "
+            "camera took them, or declare the lights distant", {"falloff_taken_out": True},
+            search.at_all_pixels(given, degrees_between(declared.normal, level.normal)))
     way, factor = search.span * found.values[:3], float(np.exp(found.values[3]))
     words = ", ".join(f"{length:+.3f}" for length in way)
     turned, axes = ("", "") if not found.is_turned else (f"turned {found.turn.words()} through the object, ", "axes, ")

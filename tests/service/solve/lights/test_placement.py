@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
-from tests.scenes.captures import angles_degrees
+from tests.scenes.captures import angles_degrees, write_lit
 
 DOME = near_lights.dome(40)
 LAMPS = near_lights.lamps(DOME, 12, 2.5)
@@ -100,3 +100,22 @@ def test_a_rig_that_is_turned_is_named_and_turned_back(relit, tmp_path, lights):
     assert any("frames[].light.position_m: all lights" in sentence for sentence in report["warnings"])
     assert np.median(error / sigma) < 2 and (error > 5 * sigma).mean() < 0.01  # an error that all share is one draw of its σ
     assert np.median(error) < 2 if lights == "refined" else np.median(error) > 3
+
+
+@pytest.mark.long
+def test_images_without_falloff_are_named(relit, tmp_path):
+    """As software makes them that corrects the falloff on a plane; it was told as lights that moved."""
+    middle = DOME.points[DOME.mask].mean(axis=0)
+    plane = np.concatenate([DOME.points[..., :2], np.full_like(DOME.points[..., :1], middle[2])], axis=-1)
+    images = []
+    for lamp in LAMPS:
+        squares = ((lamp.position - plane) ** 2).sum(axis=-1, keepdims=True)
+        images.append(near_lights.render(DOME, lamp) * DOME.mask[..., None] * squares / ((lamp.position - middle) ** 2).sum())
+    write_lit(tmp_path, images, [lamp.manifest() for lamp in LAMPS], camera=DOME.camera, mask=DOME.mask, name="dome")
+    outcome = relit("solve", tmp_path, "--out", tmp_path / "out", "--method", "robust", "--device", "cpu")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert outcome.code in (0, 1) and any("was taken out of them already" in sentence for sentence in report["warnings"])
+    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    known = DOME.mask & (maps.sigma > 0)
+    error = angles_degrees(maps.normal, DOME.normal)[known]
+    assert np.median(error) > 2 and (error > 3 * maps.sigma[known]).mean() < 0.01
