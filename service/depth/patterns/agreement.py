@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 from kernels.device import to_numpy
 from kernels.status import SOLVED, Status
 from kernels.structured.opaque_surface import check_surface
-from service.depth.base.epipolar import Contradiction, contradiction, difference, view_facts
+from service.depth.base.epipolar import Contradiction, contradiction, difference, moved_middle, view_facts
 from service.depth.base.solution import DepthSolution
 from service.depth.patterns.coordinates import AxisMaps, DecodedSolution, stands_alone
 from service.requests.depth import DepthRequest
@@ -173,6 +173,14 @@ def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, fou
             f"projector: columns and rows contradict its calibration, {difference(declared, found.declared)}: depths are those of a "
             f"projector that is ({found.noise_px:.2g} px are left), which found.refined_projector in report.json holds, and the standard "
             "deviations hold what this leaves open")
+    elif found.aside:
+        devices = (("projector", declared), ("camera", camera))
+        places = " or ".join(f"{devices[device][0]}.principal_px were [{moved_middle(devices[device][1], *told, device)}]"
+                             for device, told in found.aside.items())
+        solution.warnings.append(
+            f"projector: columns and rows contradict the calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "
+            f"noise), about as if {places}: check whether it is that of these images, or measure it again with relit calibrate procam; the "
+            "standard deviations hold the error that this makes")
     elif not found.plausible:
         solution.warnings.append(
             f"projector: columns and rows contradict its calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "
@@ -182,7 +190,7 @@ def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, fou
         solution.warnings.append(
             f"projector: columns and rows contradict its calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "
             f"noise), {difference(declared, found.projector)}: measure it again with relit calibrate procam, or take it as found "
-            "(--refine-projector); the standard deviations hold the error that this makes")
+            "(--refine-projector); the standard deviations hold the error that this makes, not that of a principal_px far aside")
 
 
 def _judged(solution: DepthSolution, u: AxisMaps, v: AxisMaps) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.base.epipolar import PRIOR, Contradiction, settled, view_facts
+from service.depth.base.epipolar import VIEW, Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.readings import full_scale
@@ -128,7 +128,7 @@ def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthR
     warnings: list[str] = []
     textured = ~np.isin(disparity.status, (Status.UNSOLVED, Status.LOW_MODULATION))
     if (disparity.status == Status.OK).sum() < FEW * textured.sum():  # perhaps because of what no turn explains
-        anything = contradicted(offsets, geometry, view, free=len(PRIOR))
+        anything = contradicted(offsets, geometry, view, free=VIEW)
         contradiction = anything if anything is not None and not anything.plausible else contradiction
     believed = contradiction is None or contradiction.plausible
     if believed and by_chance(offsets):

@@ -107,6 +107,26 @@ def test_a_principal_point_aside_is_covered(rig):
     assert told is not None or np.median(error) < 0.01
 
 
+@pytest.mark.parametrize(("which", "aside"), [("projector", 20.0), ("projector", -20.0), ("camera", 15.0), ("camera", -15.0)])
+def test_a_principal_point_a_tenth_of_the_width_aside_is_named(which, aside):
+    """Along the baseline, where the lines tell the least: all depths were off by more than five sigma."""
+    points, pose, uv = scene("left above", 5)
+    uv = uv + np.random.default_rng(5).normal(0, 0.05, uv.shape)
+    given = declared(pose)
+    if which == "projector":
+        given["principal_px"] = [PROJECTED[0] / 2 + aside, PROJECTED[1] / 2]
+    declares = points - points[..., 2:] * np.array([-aside / FOCAL, 0.0, 0.0]) * (which == "camera")
+    found = triangulated(declares, uv, given).reshape(-1, 3)
+    told = contradiction(Projector.model_validate(given), found, uv.reshape(-1, 2), np.full((uv[..., 0].size, 2), 0.05),
+                         least_px=LEAST_PX, alike=ALIKE)
+    error = np.abs(found[:, 2] - points[..., 2].ravel())
+    own = 0 if which == "projector" else 1
+    assert told is not None and next(iter(told.aside)) == own
+    change = told.aside[own][0][[6, 7] if own == 0 else [8, 9]] * 0.015 * (LENS if own == 0 else FOCAL)  # of units of 1.5 % of the focal
+    assert np.abs(change - (-aside, 0)).max() < 0.05 * abs(aside)  # five standard deviations of the noise
+    assert (error > 5 * np.hypot(*told.moved(found))).mean() < 0.01
+
+
 def written(folder, wrong):
     """A capture under two periods along both axes on cloth, with shot noise; the true depth."""
     points, pose, uv = scene("right", 8)
