@@ -37,6 +37,9 @@ taken for translucent. Noise alone goes beyond it at one place in 370, which mak
 CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""
+OF_A_PIXEL = 0.07
+"""Lag of stripes over what a camera pixel sees of the projector, from which on it is said: pixels that see several of it find the edges of
+right captures up to .064 of that aside, in a quarter of 48 simulated ones. Sigma is wider from CLEAR_PX on."""
 FOLDED = 0.005, 0.33
 """The same part, least and most, from which on single places are off because light bounces between folds: to either side, as folds open to
 both. Nothing is said of it, and sigma is wider in the squares around these places alone. Waves that are no sines lag everywhere."""
@@ -67,7 +70,7 @@ class LagFinding(NamedTuple):
     usual_px: float
     """Median of the lag where it is clear."""
     share: float
-    """Part of the decoded pixels where it is clear; 0: at too few, or to both sides."""
+    """Part of the decoded pixels where it is clear; 0: at too few, to both sides, or by too little of a camera pixel."""
 
     def sentences(self, axis: str) -> list[str]:
         """Return what a user is told."""
@@ -152,7 +155,10 @@ def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Co
         beside = maximum_filter(lags.single(), AROUND)
     else:
         return None
-    return LagFinding(np.where(beside, lags.error, 0), *(clear or (0.0, 0.0)))
+    usual, share = clear or (0.0, 0.0)
+    seen_by_a_pixel = float(np.median(np.hypot(*np.gradient(axis.coordinate))[axis.solved]))
+    said = measure.between_waves or usual >= OF_A_PIXEL * seen_by_a_pixel
+    return LagFinding(np.where(beside, lags.error, 0), usual, share if said else 0.0)
 
 
 class _Measure(NamedTuple):
