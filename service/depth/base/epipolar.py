@@ -45,8 +45,9 @@ STEP = 1e-4
 """Change of a parameter by which derivatives are taken."""
 MOST_POINTS = 20_000
 """Number of points, evenly spread, that are fitted."""
-ENOUGH = 33
-"""Number of points whose errors are their own, below which nothing is concluded."""
+ENOUGH, OF_THEIR_OWN = 33, 10
+"""Number of points below which nothing is concluded, and of those whose errors are their own: no right one of 150 small captures of 90 to
+900 points was contradicted."""
 LEAST_GAIN = 50.0
 """Least drop of the squared residuals over their variance that tells a contradiction."""
 LEAST_SQUARE = 150.0
@@ -115,12 +116,16 @@ def difference(declared: Projector, found: Projector) -> str:
     return f"as if it were turned by {turn:.2f}° from there and its focal_px {found.focal_px[0] / declared.focal_px[0]:.3f} times that"
 
 
-def moved_middle(view: Projector | Camera, part: np.ndarray, covariance: np.ndarray, device: int) -> str:
-    """Return the principal point of a view or camera with one entry of `Contradiction.aside`, for a sentence."""
-    middle = view.principal_px or (view.resolution[0] / 2, view.resolution[1] / 2)
-    pixels = PRIOR[6] * np.array(view.focal_px)
-    places, spreads = np.array(middle) + part[list(ASIDE[device])] * pixels, np.sqrt(np.diag(covariance))[list(ASIDE[device])] * pixels
-    return ", ".join(f"{place:.4g} ± {spread:.2g}" for place, spread in zip(places, spreads, strict=True))
+def places_aside(found: Contradiction, view: Projector, camera: Camera, names: tuple[str, str] = ("projector", "camera")) -> str:
+    """Return where the principal points are that explain a contradiction, for a sentence. `names`: of the fields of view and camera."""
+    said = []
+    for device, (part, covariance) in found.aside.items():
+        each, rows = (view, camera)[device], list(ASIDE[device])
+        middle, pixels = each.principal_px or np.array(each.resolution) / 2, PRIOR[6] * np.array(each.focal_px)
+        places, spreads = middle + part[rows] * pixels, np.sqrt(np.diag(covariance))[rows] * pixels
+        told = ", ".join(f"{place:.4g} ± {spread:.2g}" for place, spread in zip(places, spreads, strict=True))
+        said.append(f"{names[device]}.principal_px were [{told}]")
+    return "about as if " + " or ".join(said)
 
 
 def view_facts(view: Projector, name: str, pose: object) -> dict[str, Any]:
@@ -174,7 +179,7 @@ def _turned(projector: Projector, part: np.ndarray) -> Projector:
 
 
 def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, deviations: np.ndarray, *, least_px: float,
-                  alike: float = 1.0, free: int = VIEW, before: Contradiction | None = None) -> Contradiction | None:
+                  alike: float = 1.0, free: int = VIEW, typed: bool = True, before: Contradiction | None = None) -> Contradiction | None:
     """Return how the places of points contradict the calibration of a view, None where noise explains them.
 
     Args:
@@ -185,10 +190,11 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
         least_px: least systematic distance from the epipolar lines that is one.
         alike: number of neighbours whose errors are counted as one.
         free: number of the first parameters that are fitted; the others are as they were given.
+        typed: whether a principal point may be typed wrongly, which a turn about the same axis looks like.
         before: the contradiction by which the view was found. How far the view is from the one that was given then counts, and what the
             fit leaves open, however well it explains the places.
     """
-    if len(points) < ENOUGH * alike:
+    if len(points) < max(ENOUGH, OF_THEIR_OWN * alike):
         return None
     chosen = slice(None, None, -(-len(points) // MOST_POINTS))
     by, way = _derivatives(projector, points[chosen])
@@ -226,7 +232,7 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
     if before is None and (size < least_px or gain < LEAST_GAIN or not sure):
         return None
     found = _turned(projector, np.clip(part, -LARGEST, LARGEST) * PRIOR)
-    aside = {} if free < VIEW or before is not None else _aside((every * weight[:, None]).T @ every, (every * weight[:, None]).T @ off)
+    aside = {} if before is not None or not typed else _aside((every * weight[:, None]).T @ every, (every * weight[:, None]).T @ off)
     return Contradiction(size, float(np.median(np.abs(left))), projector, found, part, covariance, so_far + part, aside)
 
 

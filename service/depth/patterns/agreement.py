@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 from kernels.device import to_numpy
 from kernels.status import SOLVED, Status
 from kernels.structured.opaque_surface import check_surface
-from service.depth.base.epipolar import Contradiction, contradiction, difference, moved_middle, view_facts
+from service.depth.base.epipolar import Contradiction, contradiction, difference, places_aside, view_facts
 from service.depth.base.solution import DepthSolution
 from service.depth.patterns.coordinates import AxisMaps, DecodedSolution, stands_alone
 from service.requests.depth import DepthRequest
@@ -174,13 +174,10 @@ def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, fou
             f"projector that is ({found.noise_px:.2g} px are left), which found.refined_projector in report.json holds, and the standard "
             "deviations hold what this leaves open")
     elif found.aside:
-        devices = (("projector", declared), ("camera", camera))
-        places = " or ".join(f"{devices[device][0]}.principal_px were [{moved_middle(devices[device][1], *told, device)}]"
-                             for device, told in found.aside.items())
         solution.warnings.append(
             f"projector: columns and rows contradict the calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "
-            f"noise), about as if {places}: check whether it is that of these images, or measure it again with relit calibrate procam; the "
-            "standard deviations hold the error that this makes")
+            f"noise), {places_aside(found, declared, camera)}: check whether it is that of these images, or measure it again with relit "
+            "calibrate procam; the standard deviations hold the error that this makes")
     elif not found.plausible:
         solution.warnings.append(
             f"projector: columns and rows contradict its calibration by {found.size_px:.2g} px ({found.noise_px:.2g} px are left by "

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.depth.base.epipolar import Contradiction, contradiction, difference
+from service.depth.base.epipolar import Contradiction, contradiction, difference, places_aside
 from service.depth.stereo.rectification import Rectification
 from service.depth.stereo.row_offsets import RowOffsets
 from stage.capture.camera import Camera, OtherCamera
@@ -45,7 +45,8 @@ def contradicted(offsets: RowOffsets, geometry: Rectification, other: Projector,
     points = _towards(left.left + col, left.top + row, focal) * depth[:, None] @ geometry.rectified_from_reference
     seen = _towards(right.left + col - disparity, right.top + row + offset, focal) @ geometry.rectified_from_other
     places = np.stack(geometry.other.image_coordinates(seen / -seen[:, 2:]), axis=1)
-    return contradiction(other, points, places, np.stack([sigma, sigma], axis=1), least_px=LEAST_PX, free=free, before=before)
+    return contradiction(other, points, places, np.stack([sigma, sigma], axis=1), least_px=LEAST_PX, free=free, typed=False,
+                         before=before)
 
 
 def by_chance(offsets: RowOffsets) -> bool:
@@ -63,14 +64,18 @@ def widened(depth: np.ndarray, sigma: np.ndarray, camera: Camera, found: Contrad
     return wider
 
 
-def sentence(name: str, found: Contradiction, given: Projector) -> str:
+def sentence(name: str, found: Contradiction, given: Projector, camera: Camera) -> str:
     """Return what is said of a camera whose calibration is contradicted.
-    `name`: the field of the camera and its name. `given`: the camera as it was given."""
+    `name`: the field of the camera and its name. `given`: the camera as it was given. `camera`: the first one."""
+    seen = f"{name}: the places that both cameras see contradict its calibration"
+    if found.aside:
+        places = places_aside(found, given, camera, ("its camera", "the first camera"))
+        return (f"{seen} by {found.size_px:.2g} px, {places}: check whether it is that of these images, or calibrate the cameras again "
+                "(relit calibrate stereo); the standard deviations hold the error that this makes")
     if not found.plausible:
         return (f"{name}: where both cameras see the same places contradicts its calibration by more than a camera can be off: images that "
                 "are mirrored, upside down or of another camera do that, and a pose that is the inverse of the right one; no depth "
                 "of it is trusted")
-    seen = f"{name}: the places that both cameras see contradict its calibration"
     if given is not found.declared:
         return (f"{seen}, {difference(given, found.declared)}: depths are those of a camera that is ({found.noise_px:.2g} px are left), "
                 "which report.json holds under found, and the standard deviations hold what this leaves open")

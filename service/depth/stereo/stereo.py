@@ -139,7 +139,7 @@ def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthR
         facts["contradiction_px"] = _short(contradiction.size_px)
         if view is not given:
             facts["refined"] = view_facts(view, "camera_from_other", view.camera_from_projector)
-        warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given))
+        warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given, capture.camera))
         pair = pair._replace(sigma=widened(pair.depth, pair.sigma, capture.camera, contradiction, given))
     if not believed and request.least_confidence is None:
         pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))

@@ -109,12 +109,12 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
     if contradicted is not None:
         assert solution.sigma is not None
         solution.sigma = widened(solution.depth, solution.sigma, capture.camera, contradicted, given)
-        warnings.append(sentence("--beside: camera", contradicted, given))
+        warnings.append(sentence("--beside: camera", contradicted, given, capture.camera))
         told["contradiction_px"] = float(f"{contradicted.size_px:.3g}")
         if view is not given:
             pose = _world(capture) @ np.array(view.camera_from_projector)
             told["refined"] = view_facts(view, "world_from_camera", pose.tolist())
-        if not contradicted.plausible and request.least_confidence is None:
+        if not (contradicted.plausible or contradicted.aside) and request.least_confidence is None:
             solution.status[solution.solved] = Status.UNSURE
     conclude(solution, doubt_pixels(solution, residual, capture.camera, view, device), mask, request, warnings, ADVICE | POSES)
     return solution

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from service.depth.stereo.row_offsets import row_offsets
 from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast
+from stage.formats.images import write_png
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
@@ -110,6 +111,31 @@ def test_a_wrong_pose_is_named_and_sigma_holds_it(relit, tmp_path, degrees):
     assert turns[0] > turns[1]
     left = np.abs(refined.depth - first.depth)[refined.mask]
     assert np.median(left) < 0.8 * np.median(error * maps.sigma[maps.mask]) and (left > 5 * refined.sigma[refined.mask]).mean() < 0.01
+
+
+def test_a_principal_point_a_tenth_of_the_width_aside_is_named_and_held(relit, tmp_path):
+    """It moved all depths by ten and more sigma."""
+    first = two_captures(tmp_path, 0.004)
+    camera = json.loads((tmp_path / "second" / "capture.json").read_text())["camera"]
+    edit_manifest(tmp_path / "second", camera={**camera, "principal_px": [SECOND.width * 0.6, SECOND.height / 2]})
+    maps, report = measured(relit, tmp_path)
+    error = np.abs(maps.depth - first.depth)[maps.mask] / maps.sigma[maps.mask]
+    assert maps.mask.mean() > 0.5 and (error > 5).mean() < 0.01
+    assert any("its camera.principal_px were" in sentence for sentence in report["warnings"])
+
+
+def test_an_inverse_pose_of_a_small_thing_gives_no_depth(relit, tmp_path):
+    """Few pixels are lit on it: they were solved without a word."""
+    first = two_captures(tmp_path, 0.004)
+    part = np.zeros(first.depth.shape, np.uint8)
+    part[30:50, 40:62] = 255  # 440 pixels
+    write_png(tmp_path / "first" / "mask.png", part, srgb=False)
+    camera = json.loads((tmp_path / "second" / "capture.json").read_text())["camera"]
+    edit_manifest(tmp_path / "first", mask="mask.png")
+    assert not measured(relit, tmp_path)[1]["warnings"]
+    edit_manifest(tmp_path / "second", camera={**camera, "world_from_camera": np.linalg.inv(PLACE).tolist()})
+    relit("depth", tmp_path / "first", "--beside", tmp_path / "second", "--out", tmp_path / "out", "--device", "cpu")
+    assert not DepthMaps.read(tmp_path / "out" / "depth.exr").mask.any()
 
 
 @pytest.mark.parametrize("times", [2.0, pytest.param(0.5, marks=pytest.mark.long)])
