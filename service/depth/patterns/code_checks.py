@@ -40,7 +40,8 @@ SOME = 3000
 AS_DECLARED, OFFSET = (0.9, 0.7), (0.12, 0.2)
 """Length of the mean at the declared period over the largest at any, below which another period is named, and periods by which a wave is
 offset, from which on it is doubted: with stripes up to half a period, and with wider ones, which tell less. A wave that runs backwards is
-an offset where the stripes are half a period wide and lie along the image rows."""
+an offset where the stripes are half a period wide and lie along the image rows, and right ones look backwards, by .9, where they lie about
+so."""
 
 
 class Stripes(NamedTuple):
@@ -264,9 +265,10 @@ def _compare_wave(phasors: np.ndarray, place: np.ndarray, period: float, *, wide
         return None
     declared, free = _turning(phasors, place, np.array([1 / period, best]))
     offset, own = (float(np.angle(mean)) / (2 * np.pi) for mean in (declared, free))
-    if abs(declared) >= AS_DECLARED[wide] * strength and abs(offset) <= OFFSET[wide]:
+    backwards = abs(best + 1 / period) * span < 0.5
+    if abs(declared) >= AS_DECLARED[wide or backwards] * strength and abs(offset) <= OFFSET[wide]:
         return None
-    if abs(best + 1 / period) * span < 0.5:
+    if backwards:
         return "run against the stripes: check step, whose order is reversed,"
     if abs(declared) < AS_DECLARED[wide] * strength or abs(own) < abs(offset) / 2:
         return f"look like waves of {1 / abs(best):.4g} px{' against the stripes' if best < 0 else ''}: check period_px, and stripe_px"

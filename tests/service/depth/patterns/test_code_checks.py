@@ -131,5 +131,16 @@ def test_stripes_that_neighbouring_pixels_skip_raise_no_doubt(step):
     assert said(plane, fine, fine) is None
 
 
+def test_stripes_along_the_image_rows_do_not_look_backwards(step=4.36, tilt=-0.0162, width=40):
+    """Two pixels of a stripe half a period wide tell nothing of the direction: no depth of such right captures was believed."""
+    row, col = np.indices((int(0.95 * SIZE[1] / step), width))
+    v = step * (row + tilt * (col - width / 2)) + 0.5
+    uv = np.stack([col + 0.5, np.clip(v, 0, SIZE[1] - 0.5)], axis=-1)
+    plane = SimpleNamespace(albedo=np.full((*row.shape, 3), 0.7), uv=uv, shaded=(v < 0) | (v > SIZE[1] - 1), depth=np.ones(row.shape))
+    right = [*phase_patterns("row", 16.0), *gray_patterns("row", stripe=8)]
+    assert said(plane, right, right) is None
+    assert said(plane, right, changed(right, "phase", step=lambda p: -p["step"] % 4)) is not None
+
+
 def test_stripes_beyond_the_projector_are_named(scene):
     assert "projector.resolution" in said(scene, GRAY, GRAY, (88, 96))
