@@ -67,8 +67,8 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
     readings = grey[roles]
     variance = noise.variance(readings.mean(axis=0))
 
-    def left(order: np.ndarray) -> float:
-        return float(np.median(((left_over @ readings[order.ravel()]) ** 2).sum(axis=0) / variance) / free)
+    def left(order: np.ndarray, over: np.ndarray = left_over) -> float:
+        return float(np.median(((over @ readings[order.ravel()]) ** 2).sum(axis=0) / variance) / free)
 
     declared = np.arange(len(roles)).reshape(len(waves), steps)
     before = left(declared)
@@ -80,6 +80,9 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
         order[:, [first, second]] = declared[:, [second, first]]
         found.append((left(order), " and ".join(map(str, sorted((named[0][first], named[0][second]))))))
     exchanges = len(found)
+    for other in (steps - 1, steps + 1):  # both ends of a period, and all steps but the last
+        over = _without_waves(code, len(grey), steps / other)[roles][:, roles]
+        found.append((left(declared, over), f"a step is 1/{other} of a period: check step and steps in the frames' patterns"))
     taken = np.argsort(np.argsort(roles))  # place of each frame in the sequence
     across = declared.reshape(steps, len(waves)).T
     words = "all {} come before the next {}: check the order of the images (--order axis,{} of relit import phase)"
@@ -96,11 +99,11 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
     return ", or if ".join(others)
 
 
-def _without_waves(code: PhaseCode, frames: int) -> np.ndarray:
-    """Return the matrix [frames, frames] that leaves of readings what no mean and no wave explains."""
+def _without_waves(code: PhaseCode, frames: int, times: float = 1.0) -> np.ndarray:
+    """Return the matrix [frames, frames] that leaves of readings what no mean and no wave explains; with steps so many `times` as wide."""
     parts = [np.zeros(frames)]
     for wave in code.waves:
-        at, turns = list(wave.frames), 2 * np.pi * np.array(wave.shifts)
+        at, turns = list(wave.frames), 2 * np.pi * times * np.array(wave.shifts)
         parts[0][at] = 1.0
         for harmonic in range(1, 1 + max(1, len(at) // STEPS_OF_HARMONIC)):
             for shape in (np.cos(harmonic * turns), np.sin(harmonic * turns)):

@@ -49,6 +49,18 @@ def test_exchanged_steps_are_named(name, gamma):
     assert ("the steps 1 and 2 are exchanged" if name == "one of eight" else "the steps 0 and 3 or 1 and 2 are exchanged") in found
 
 
+@pytest.mark.parametrize("gamma", [1.0, 1.2])
+@pytest.mark.parametrize("more", [-1, 1])
+@pytest.mark.parametrize("name", ["one", "one of eight", "three"])
+def test_steps_that_are_another_part_of_a_period_are_named(name, more, gamma):
+    """A last frame that shows the first pattern again (both ends of a period), and one that is left out: nearly all depths of a wave with
+    Gray code were off by more than five sigma."""
+    patterns = patterns_of(name)
+    steps = SETS[name][1] + more
+    shown = changed(patterns, steps=lambda pattern: steps, step=lambda pattern: pattern.step % steps)
+    assert f"a step is 1/{steps} of a period: check step and steps" in order_said(frames_of(shown, gamma=gamma), patterns)
+
+
 @pytest.mark.parametrize("name", ["two", "three"])
 def test_exchanged_loops_are_named(name):
     """Three steps of one wave fit any phase, but all periods have one mean."""
