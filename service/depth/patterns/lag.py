@@ -37,9 +37,9 @@ taken for translucent. Noise alone goes beyond it at one place in 370, which mak
 CLEAR_SHARE, ONE_WAY = 0.02, 0.8
 """Part of the decoded pixels with a clear lag, and part of these whose lag has the same direction, from which on light runs below surfaces:
 texture and edges make lags of both directions."""
-OF_A_PIXEL = 0.07
-"""Lag of stripes over what a camera pixel sees of the projector, from which on it is said: pixels that see several of it find the edges of
-right captures up to .064 of that aside, in a quarter of 48 simulated ones. Sigma is wider from CLEAR_PX on."""
+OF_A_PIXEL = 0.06
+"""Lag of stripes over what a camera pixel sees of the projector, from which on it is said: pixels that see several of its pixels find the
+edges of right captures up to .05 of that aside, in a quarter of 48 simulated ones, and further in two. Sigma is wider from CLEAR_PX on."""
 FOLDED = 0.005, 0.33
 """The same part, least and most, from which on single places are off because light bounces between folds: to either side, as folds open to
 both. Nothing is said of it, and sigma is wider in the squares around these places alone. Waves that are no sines lag everywhere."""
