@@ -19,7 +19,7 @@ from stage.patterns.base import Axis, Index, UniformPattern, check_agreement, ch
 class _BitPattern(Strict):
     """One bit of a number that every stripe has."""
 
-    code: str
+    code: Literal["binary", "gray", "xor"]
     """The code."""
     axis: Axis
     """The axis of the projector along which the code varies."""
