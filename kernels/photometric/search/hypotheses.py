@@ -1,7 +1,7 @@
 """Normals by hypothesis and test: each candidate normal is judged by how well a non-negative mixture of lobes explains the
 readings.
 
-For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed widths. The
+For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others highlights of fixed widths. The
 mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 · reading, and the
 candidate's cost is Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast shadow, which has a fixed cost:
 any candidate may be shadowed, but no reading may be brighter than the lobes of the candidate. Candidates are rings about the best normal so

@@ -213,8 +213,9 @@ def find_placement(given: SolveInput, lights: PlacedLights) -> Placement | None:
     if not found.plausible or np.median(after) > EXPLAINED or gain < LEAST_GAIN or less.sum() < SURE * np.sqrt((less**2).sum()):
         return None
     level = search.fit_without_falloff()
-    if cost_of(level).mean() < after.mean():
-        left = float(cost_of(level).mean() / (before.mean() + QUIET))
+    level_cost = cost_of(level).mean()
+    if level_cost < after.mean():
+        left = float(level_cost / (before.mean() + QUIET))
         return Placement(
             "frames[].light: the images look as if the falloff of near lights (1/r²) was taken out of them already, as by flat fields or a "
             f"correction: without it the readings cost {100 * (1 - left):.0f} % less, more than with moved lights; give images as the "
