@@ -95,8 +95,8 @@ def _misfit_of_rows(normal: np.ndarray, points: np.ndarray, sight: np.ndarray, p
         steps.append(one[1] - other[1])
         planes.append(steps[-1] - (_excess(middle, one) - _excess(middle, other))[..., None] * sight)
     surface, given = (_unit(np.cross(*two)) for two in (steps, planes))
-    angle = np.degrees(np.arccos(np.clip((surface * given).sum(axis=-1), -1, 1)))
-    turn = (((right[0] - left[0]) ** 2).sum(axis=-1) + ((above[0] - below[0]) ** 2).sum(axis=-1)) / 4
+    angle = np.degrees(np.arccos(np.clip(np.vecdot(surface, given), -1, 1)))
+    turn = sum(np.vecdot(bend, bend) for bend in (right[0] - left[0], above[0] - below[0])) / 4
     weight = inside / (1 + turn / STEEP**2)
     pooled, count = _pool(weight * angle), _pool(weight)
     return np.divide(pooled, count, out=np.zeros_like(pooled), where=count > LEAST_COUNT).astype(np.float32)
@@ -108,7 +108,7 @@ def _excess(here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...]) -> np.n
     against the normal between them would show a curve for an error."""
     (n, point, sight), (other_n, other_point, other_sight) = here, there
     step = other_point - point
-    return np.asarray(0.5 * sum((a * step).sum(axis=-1) / np.maximum((a * b).sum(axis=-1), STEEPEST)
+    return np.asarray(0.5 * sum(np.vecdot(a, step) / np.maximum(np.vecdot(a, b), STEEPEST)
                                 for a, b in ((n, other_sight), (other_n, sight))))
 
 
@@ -119,7 +119,7 @@ def _sides(values: np.ndarray) -> list[np.ndarray]:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return vectors / np.maximum(np.sqrt(np.vecdot(vectors, vectors))[..., None], 1e-12)
 
 
 def _pool(values: np.ndarray) -> np.ndarray:
