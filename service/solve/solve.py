@@ -1,6 +1,6 @@
 """Solve a capture: images → normals, reflectance and height, in maps.exr and report.json."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,9 +25,10 @@ from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
-from service.solve.steadiness import find_motion
-from service.solve.translucency import find_translucency
-from service.solve.veil import find_veil
+from service.solve.sliding import Slide, find_slide
+from service.solve.steadiness import Drift, Shake, find_motion
+from service.solve.translucency import Translucency, find_translucency
+from service.solve.veil import Veil, find_veil
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
@@ -95,6 +96,21 @@ class _Judged(NamedTuple):
     """Part of the surface whose height rests on normals that are hardly known."""
 
 
+def _spoilt(given: SolveInput, lights: DistantLights, solution: Solution,
+            moved: bool) -> Iterator[Slide | Shake | Drift | Translucency | Veil]:
+    """Yield what spoils the images beside the lights; whether frames are moved with texture is asked where it may tell."""
+    slide = find_slide(given, lights, solution)
+    if slide is not None:  # which blurs edges, too
+        yield slide
+        return
+    if moved:
+        yield from find_motion(given, lights, solution)
+    for find in (find_translucency, find_veil):
+        found = find(given, lights, solution)
+        if found is not None:
+            yield found
+
+
 def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged:
     """Find the height of a solution, how sure it is, and what does not fit; the solution is changed."""
     given, shape = opened.given, opened.given.mask.shape
@@ -107,19 +123,10 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     diagnose(given, opened.capture, opened.lights, opened.declared, solution)
     if isinstance(opened.lights, DistantLights):
         # highlights bend what least squares makes of texture, and lights that are wrong move everything
-        if opened.method is not Method.LAMBERT and len(solution.warnings) == said:
-            motion = find_motion(given, opened.lights, solution)
-            solution.warnings += motion.sentences
-            if motion.drift is not None:
-                raise_error(solution, motion.drift.degrees)
-        translucency = find_translucency(given, opened.lights, solution)
-        if translucency is not None:
-            solution.warnings.append(translucency.sentence)
-            raise_error(solution, translucency.degrees)
-        veil = find_veil(given, opened.lights, solution)
-        if veil is not None:
-            solution.warnings.append(veil.sentence)
-            raise_error(solution, veil.degrees)
+        moved = opened.method is not Method.LAMBERT and len(solution.warnings) == said
+        for found in _spoilt(given, opened.lights, solution, moved):
+            solution.warnings.append(found.sentence)
+            raise_error(solution, found.degrees)
     if "left_out_misfit" in solution.facts:
         from service.solve.methods.support import raise_undescribed
 

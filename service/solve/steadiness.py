@@ -56,32 +56,32 @@ class Drift(NamedTuple):
                 "fix camera and object, or align the images first")
 
 
-class Motion(NamedTuple):
-    """Moves of the frames against each other."""
+class Shake(NamedTuple):
+    """Moves from frame to frame."""
 
-    shake_px: float | None
-    """From frame to frame, root mean square and rather too little; None where frames seem steady."""
-    drift: Drift | None
+    px: float
+    """Their root mean square, and rather too little."""
+    degrees: float = 0.0
+    """Error of normals that the fit has not left in sigma."""
 
     @property
-    def sentences(self) -> list[str]:
+    def sentence(self) -> str:
         """What is said of it."""
-        shaken = [] if self.shake_px is None else [
-            f"frames: what the camera sees moves by {self.shake_px:.2g} px or more from image to image, as of a camera held by hand or a "
-            "stage that shakes: edges blur, and texture turns normals; fix both, or align the images first"]
-        return shaken if self.drift is None else [*shaken, self.drift.sentence]
+        return (f"frames: what the camera sees moves by {self.px:.2g} px or more from image to image, as of a camera held by hand or a "
+                "stage that shakes: edges blur, and texture turns normals; fix both, or align the images first")
 
 
-def find_motion(given: SolveInput, lights: DistantLights, solution: Solution) -> Motion:
+def find_motion(given: SolveInput, lights: DistantLights, solution: Solution) -> list[Shake | Drift]:
     """Return how the frames of a solve are moved against each other."""
     if not (lights.irradiance > 0).all():
-        return Motion(None, None)
+        return []
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     seen = list(squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS))
-    return Motion(_shake(lights.direction[evenly(len(lights.direction), MOST_LIGHTS)], seen), _drift(lights, solution, estimated, seen))
+    found = _shake(lights.direction[evenly(len(lights.direction), MOST_LIGHTS)], seen), _drift(lights, solution, estimated, seen)
+    return [motion for motion in found if motion is not None]
 
 
-def _shake(directions: np.ndarray, seen: list[Square]) -> float | None:
+def _shake(directions: np.ndarray, seen: list[Square]) -> Shake | None:
     """Return how far frames are moved against each other, root mean square; None if they seem steady. `directions`: [lights, 3]."""
     count = len(directions)
     if count < LEAST_LIGHTS:
@@ -107,7 +107,7 @@ def _shake(directions: np.ndarray, seen: list[Square]) -> float | None:
     moves -= linear @ np.linalg.lstsq(linear, moves.transpose(1, 0, 2).reshape(count, 4), rcond=None)[0].reshape(3, 2, 2).transpose(1, 0, 2)
     both, each = (moves[0] * moves[1]).sum(), np.sqrt((moves**2).sum(axis=(1, 2)).prod())
     px = float(np.sqrt(max(both, 0) / count))
-    return px if px >= LEAST_PX and both >= LEAST_ALIKE * each else None
+    return Shake(px) if px >= LEAST_PX and both >= LEAST_ALIKE * each else None
 
 
 def _drift(lights: DistantLights, solution: Solution, estimated: np.ndarray, seen: list[Square]) -> Drift | None:
