@@ -53,10 +53,8 @@ def find_slide(given: SolveInput, lights: DistantLights, solution: Solution) -> 
     if len(chosen) < LEAST_LIGHTS:
         return None
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
-    reflected = np.where(estimated.reshape(-1), solution.albedo.astype(np.float64).mean(axis=0) * solution.normal, 0)  # [3, pixels]
-    reflected = np.nan_to_num(reflected)
     directions, time = lights.direction[chosen], chosen / (len(lights.direction) - 1) - 0.5
-    moves = _moves(given, lights.irradiance[chosen].mean(axis=-1) / np.pi, directions, reflected, estimated, chosen)
+    moves = _moves(given, lights.irradiance[chosen].mean(axis=-1) / np.pi, directions, solution, estimated, chosen)
     if moves is None:
         return None
     linear = np.concatenate([np.ones((len(chosen), 1)), directions[:, :2]], axis=1)
@@ -72,22 +70,31 @@ def find_slide(given: SolveInput, lights: DistantLights, solution: Solution) -> 
     px = float(np.hypot(*move))
     if px < max(LEAST_PX, LEAST_SURE * np.sqrt(QUARTERS / weight.sum())) or (trend @ move > 0.5 * px**2).sum() < LEAST_ALIKE:
         return None
-    return Slide(px, _error(directions, time, reflected.reshape(3, *estimated.shape), move))
+    every = np.arange(estimated.size, dtype=np.int32).reshape(estimated.shape)
+    return Slide(px, _error(directions, time, _reflected(solution, estimated, every), move))
 
 
-def _moves(given: SolveInput, strength: np.ndarray, directions: np.ndarray, reflected: np.ndarray, estimated: np.ndarray,
+def _reflected(solution: Solution, estimated: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return normals times albedo at row-major positions [rows, cols] of the image: [3, rows, cols] float32, 0 where none is estimated."""
+    values = solution.albedo[:, place].astype(np.float32).mean(axis=0) * solution.normal[:, place].astype(np.float32)
+    return np.where(estimated.reshape(-1)[place], np.nan_to_num(values, posinf=0, neginf=0), 0)
+
+
+def _moves(given: SolveInput, strength: np.ndarray, directions: np.ndarray, solution: Solution, estimated: np.ndarray,
            chosen: np.ndarray) -> np.ndarray | None:
     """Return how far each frame is moved, down and right, against what is predicted of it, [quarters, lights, 2], told by each quarter of
-    the object by itself; None where none says anything."""
+    the object by itself; None where one says nothing."""
     height, width = estimated.shape
-    middle_row, middle_col = (np.median(numbers) for numbers in np.nonzero(estimated))
-    predicted_steps, rests, quarters = [], [], []
     corners = [(row, col) for row in range(0, height, SIDE) for col in range(0, width, SIDE)
                if estimated[row : row + SIDE, col : col + SIDE].sum() > LEAST_SOLVED]
-    for row, col in (corners[number] for number in (evenly(len(corners), MOST_SQUARES) if corners else ())):
+    if not corners:
+        return None
+    middle_row, middle_col = (np.median(numbers) for numbers in np.nonzero(estimated))
+    predicted_steps, rests, quarters = [], [], []
+    for row, col in (corners[number] for number in evenly(len(corners), MOST_SQUARES)):
         place = np.arange(row, min(row + SIDE, height))[:, None] * width + np.arange(col, min(col + SIDE, width))
         seen = given.stack.pick_radiance(place.reshape(-1))[0][chosen].mean(axis=-1).reshape(-1, *place.shape)
-        shading = np.maximum(np.einsum("lk,krc->lrc", directions, reflected[:, place]), 0)
+        shading = np.maximum(np.einsum("lk,krc->lrc", directions, _reflected(solution, estimated, place)), 0)
         predicted, blurred = (gaussian_filter(values, (0, BLUR, BLUR)) for values in (strength[:, None, None] * shading, seen))
         brightest = predicted.max(axis=0)
         near = brightest > LEAST_PART * brightest.max()
@@ -95,8 +102,6 @@ def _moves(given: SolveInput, strength: np.ndarray, directions: np.ndarray, refl
         predicted_steps.append(np.stack([predicted, -down, -right], axis=-1)[:, near])
         rests.append((blurred - predicted)[:, near])
         quarters.append((2 * (place // width > middle_row) + (place % width > middle_col))[near])
-    if not rests:
-        return None
     steps, rest, quarter = np.concatenate(predicted_steps, axis=1), np.concatenate(rests, axis=1), np.concatenate(quarters)
     if len(np.unique(quarter)) < QUARTERS:
         return None
