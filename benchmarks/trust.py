@@ -45,7 +45,7 @@ HEAD = """# How far confidence can be trusted
 - No sentence and no σ tells of a light source of a time-of-flight camera that stands aside and is not declared: it makes all frequencies
   wrong by the same length, so that nothing in the frames contradicts it.
 - A camera that shakes, or drifts while the lamps burn row by row, is told by the texture of the object: not where there is none or little.
-  A slow slide from the first image to the last is told by outlines and shading, in 68 of 91 captures under 12 to 40 lights that
+  A slow slide from the first image to the last is told by outlines and shading, in 67 of 91 captures under 12 to 40 lights that
   slide by 3.3 px.
   2 px over 48 images turn normals of *figure* by 5° in the median.
 - Of a translucent body normals are told to be blurred by the edges of its shadows in red and in blue: not where few shadows fall on it,
