@@ -30,7 +30,7 @@ LEAST_FREE, TINY = 0.02, 1e-12
 LEAST_PX, LEAST_SURE, LEAST_ALIKE = 0.4, 5.0, 3
 """Least move from the first frame to the last, in pixels and in standard errors of its trend, and how many quarters of the object tell at
 least half of it. Of 125 path-traced captures that are steady, and 56 under lights that are declared wrongly, none that seems
-to move by 0.3 px or more has more than 3.4 standard errors, of real ones a glossy ball under `lambert` 3.9, told by two quarters; of 91 that
+to move by 0.3 px or more has more than 3.4 standard errors, of real ones a glossy ball under `lambert` 3.9, told by two; of 91 that
 slide by 3.3 px 67 have 5."""
 
 
