@@ -27,7 +27,7 @@ ROUNDS, OUTLIER = 4, 1.5
 """Rounds of robust weights; the residual, in medians of all, that counts half."""
 LEAST_FREE, TINY = 0.02, 1e-12
 """Least part of the course of time that is not along with the light; what keeps divisions finite where nothing is lit."""
-LEAST_PX, LEAST_SURE, LEAST_ALIKE = 0.4, 5.0, 3
+LEAST_PX, LEAST_SURE, LEAST_ALIKE = 0.5, 5.0, 3
 """Least move from the first frame to the last, in pixels and in standard errors of its trend, and how many quarters of the object tell at
 least half of it. Of 125 path-traced captures that are steady, and 56 under lights that are declared wrongly, none that seems
 to move by 0.3 px or more has more than 3.4 standard errors, of real ones a glossy ball under `lambert` 3.9, told by two; of 91 that
