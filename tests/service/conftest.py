@@ -1,11 +1,13 @@
 """The program, run inside the test's process."""
 
 import sys
+from functools import cache
 from typing import NamedTuple
 
 import pytest
+from typer.main import get_command
 
-from service.cli.main import main
+from service.cli.main import main, program
 from service.cli.progress import ProgressBar
 from stage.results.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball
@@ -32,6 +34,12 @@ class Outcome(NamedTuple):
         return self.err
 
 
+@cache
+def command(wanted: str) -> object:
+    """Return the program of a command as it is run, made once: to make it takes longer than many runs."""
+    return get_command(program(wanted))
+
+
 class Program:
     """Runs `relit ARGS`; what C libraries write on the terminal is caught too.
 
@@ -46,6 +54,7 @@ class Program:
         self._monkeypatch.setattr(ProgressBar, "stage", lambda _, name, total: recording.stage(name, total))
         self._monkeypatch.setattr(ProgressBar, "advance", lambda _, done: recording.advance(done))
         self._monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
+        self._monkeypatch.setattr("service.cli.main.program", command)
         self._capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main()
