@@ -109,6 +109,7 @@ def sheet(points):
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
 
 
+@pytest.mark.long
 def test_a_sheet_thinner_than_the_truncation_keeps_its_thickness(device):
     """Both sides are within the truncation of each other: means of both would push them apart."""
     images = [range_image(shot, SIGMA) for shot in around(sheet)]
@@ -136,6 +137,7 @@ def test_a_gap_and_a_step_are_not_bridged(device):
     assert (np.abs(points[middle, :2]).max(axis=1) > 0.08 - 2 * 2.5e-3).all()  # two pixels behind the mouth at the most
 
 
+@pytest.mark.long
 def test_points_that_one_view_sees_and_the_others_see_through_are_no_surface(device):
     """A patch of wrong depths 3 cm before the sphere, in one view of eighteen; those beside it look through them."""
     shots = around(sphere, count=16)

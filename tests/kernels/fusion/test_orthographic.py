@@ -1,11 +1,11 @@
 """Range images of orthographic cameras, fused and measured against closed forms, alone and beside those of perspective cameras."""
 
 import numpy as np
-import pytest
 
 from kernels.fusion.views import RangeImage
 from tests.kernels.fusion.scene import fuse, range_image
 from tests.kernels.fusion.test_fusion import sphere
+from tests.marks import first_short
 from tests.scenes.statue import place, shoot, shoot_parallel
 
 SIDE, PIXEL, VOXEL = 96, 2.5e-3, 2.5e-3
@@ -52,7 +52,7 @@ def parallel_shots(count: int):
         yield orthographic(shot.depth, shot.mask, np.where(shot.mask[..., None], local, 0), pose, SIGMA)
 
 
-@pytest.mark.parametrize("perspective_too", [False, True])
+@first_short("perspective_too", [False, True])
 def test_a_sphere_from_all_sides_has_its_place(device, perspective_too):
     images = list(parallel_shots(8))
     if perspective_too:

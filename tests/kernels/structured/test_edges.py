@@ -10,6 +10,7 @@ from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of, refine_ed
 from kernels.structured.pattern_frames import NoiseModel, upload
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
+from tests.marks import first_short
 from tests.scenes.patterns import NOISE, frames_of, result, view
 
 WIDTH, ROWS, COLUMNS = 1280, 40, 300
@@ -55,7 +56,7 @@ def test_edges_are_finer_than_stripes(per_pixel, stripe, down, device):
 
 
 @pytest.mark.parametrize("seen", [0.0, 0.3, 0.6, 0.9, 1.3, 2.0])
-@pytest.mark.parametrize("per_pixel", [0.31, 0.83])
+@first_short("per_pixel", [0.31, 0.83])
 def test_sigma_holds_edges_that_pass_between_pixels_unseen(per_pixel, seen, device):
     """Pixels see a part of the distance between them, in the limit points, as in images that are shrunk without a filter: to WHOLE of it
     both pixels of an edge see one stripe alone where it passes between these parts."""

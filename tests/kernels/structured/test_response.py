@@ -13,6 +13,7 @@ from kernels.structured.unwrap import unwrap_jointly
 from stage.patterns.codes import collect
 from stage.patterns.modulated import modulated_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
+from tests.marks import first_short
 from tests.scenes.patterns import frames_of, places, result
 
 WIDTH, COUNT = 800, 3000
@@ -54,7 +55,7 @@ def test_bent_phases_are_put_right(name, steps, device):
         assert ok.sum() < 100 or np.median(np.abs(plain - u)[ok] / plain_sigma[ok]) > 2
 
 
-@pytest.mark.parametrize("name", RESPONSES)
+@first_short("name", RESPONSES)
 def test_bent_micro_and_modulated_waves(name, device):
     response, u = RESPONSES[name], places(COUNT, WIDTH)
     v = np.random.default_rng(8).uniform(0, 600, COUNT)

@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from tests.kernels.surface import shapes
 from tests.kernels.surface.test_integrate import solve, worst
+from tests.marks import first_short
 
 
 def shape_error(height, truth, part):
@@ -127,7 +128,7 @@ def test_an_outline_that_meets_what_is_behind_along_one_half_is_that_of_a_part(d
     assert parts_of(found).tolist() == sorted((int((~dome & right).sum()), int((~dome & ~right).sum()), int(dome.sum())), reverse=True)
 
 
-@pytest.mark.parametrize("perspective", [False, True])
+@first_short("perspective", [False, True])
 def test_the_size_of_bands_changes_nothing(perspective, device, monkeypatch):
     """Bands of two rows and pieces of some cells, against the whole surface at one time."""
     shape, _ = shapes.ball_before_wall(96)
@@ -159,7 +160,7 @@ def test_another_material_behind_an_edge_is_a_part_of_its_own(device):
     assert worst(found, shape) * np.ptp(shape.z) < 1
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@first_short("noise", [0.0, 0.02])
 def test_an_inlay_goes_on_as_the_surface_does(noise, device):
     """Dots, stripes and a half of another material on a cap, which turns by 70° up to its rim. Tolerance: single precision."""
     shape = shapes.cap(128)

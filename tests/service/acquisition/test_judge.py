@@ -11,6 +11,7 @@ from service.errors import RequestError
 from service.requests.acquire import PlanChoices
 from service.twin.camera import OVEREXPOSED
 from stage.transforms import fibonacci_sphere
+from tests.marks import first_short
 from tests.scenes.captures import make_scene, render
 from tests.service.acquisition.scenes import KINDS, NoisyCamera, Scene, named, owl, relief, rig_of, shots_on
 
@@ -81,6 +82,7 @@ def test_a_lamp_that_a_plan_lights_twice_is_no_wrong_lamp():
     assert [*found, *judge.review()] == []
 
 
+@pytest.mark.long
 def test_lamps_in_front_of_a_matte_cap_without_texture_are_no_ambient_light():
     """All of it faces all lamps, so that the usual picture looks like any; a mean of those around is darker by the cosine to them."""
     cap, directions = make_scene(size=48), fibonacci_sphere(192)
@@ -118,8 +120,8 @@ def reviewed(scene: Scene, shots, picture_of, full_scale: float = FULL_SCALE) ->
     return at_once, {fault.shot: fault.kind for fault in judge.review()}
 
 
-@pytest.mark.parametrize("dark", [2, 0])
-@pytest.mark.parametrize("ambient", [0.0, 0.8])
+@first_short("dark", [2, 0])
+@first_short("ambient", [0.0, 0.8])
 def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
     """In the dark, where pictures are noise, and in a room with its lights on, where all show the same; without a dark picture at
     once from where lamps at two heights are there, the first ring being of twelve."""
@@ -131,7 +133,7 @@ def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
     assert found == dict.fromkeys(lamps, FaultKind.UNLIT) and at_once >= set(lamps[12:])
 
 
-@pytest.mark.parametrize("gain", [1.0, 0.004])
+@first_short("gain", [1.0, 0.004])
 def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
     """As float images have them whose full scale is any number."""
     scene, random = relief(1), np.random.default_rng(1)
@@ -149,7 +151,7 @@ def test_no_picture_of_the_owl_is_suspected_while_its_neighbours_are_not_there()
     assert reviewed(scene, shots, lambda shot: scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape)) == (set(), {})
 
 
-@pytest.mark.parametrize(("exposure", "kind"), [(0.1, FaultKind.BRIGHT), (0.4, FaultKind.CLIPPED)])
+@first_short(("exposure", "kind"), [(0.1, FaultKind.BRIGHT), (0.4, FaultKind.CLIPPED)])
 def test_a_picture_at_sixteen_times_the_exposure_is_named(exposure, kind):
     """Under the weakest lamp, where less of it is at full scale than highlights are."""
     scene = relief(1)

@@ -15,6 +15,7 @@ from service.acquisition.meter import OBJECT_PART, SHARE, TARGET, meter
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.formats import images
+from tests.marks import first_short
 from tests.scenes.captures import make_scene, write_exr
 from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, controller
@@ -60,7 +61,7 @@ def request(folder, stage, rig, exposure: float | None = None) -> AcquireRequest
                           trigger="shoot {exposure_s}", preview=True)
 
 
-@pytest.mark.parametrize("present", [0.01, 80.0])
+@first_short("present", [0.01, 80.0])
 def test_the_proposed_exposure_clips_less_than_a_thousandth_and_no_third_of_a_stop_is_given_away(tmp_path, stage, present):
     with controller(tmp_path, stage) as (rig, _):
         found = meter(request(tmp_path, stage, rig, present), refuse_to_ask)
@@ -122,7 +123,7 @@ def test_what_cannot_be_metered_is_refused(tmp_path, stage, relit):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("grey", "proposed"), [(100, 0.05), pytest.param(205, 0.01, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("grey", "proposed"), [(100, 0.05), (205, 0.01)])
 def test_a_virtual_camera_is_metered_and_left_at_the_longest_time_it_offers(tmp_path, stage, grey, proposed):
     """Its pictures are the same at all times. Grey of 100 reads 13 % of full scale, so that six times the 0.01 s that it has, or less, do;
     205 reads 61 %, and it has no time between 0.01 s and 0.02 s."""

@@ -21,6 +21,7 @@ from stage.formats import images
 from stage.results.maps import SurfaceMaps
 from stage.stack.early import EarlyStack
 from stage.stack.ingest import Ingest
+from tests.marks import first_short
 from tests.scenes.captures import angles_degrees, make_scene, render, write_capture, write_image
 from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, by_hand, check, controller, request
@@ -218,7 +219,7 @@ def test_a_capture_is_solved_and_exported(tmp_path, stage, relit):
     assert (normal[stage.scene.mask] * stage.scene.normal[stage.scene.mask]).sum(axis=-1).mean() > np.cos(np.radians(5))  # noise
 
 
-@pytest.mark.parametrize(("step", "error"), [("solve", KeyboardInterrupt()), ("export", RequestError("no room"))])
+@first_short(("step", "error"), [("solve", KeyboardInterrupt()), ("export", RequestError("no room"))])
 def test_a_step_that_fails_keeps_the_capture_and_says_one_command(tmp_path, stage, relit, monkeypatch, step, error):
     def fails(request, progress):
         raise error

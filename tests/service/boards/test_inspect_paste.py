@@ -98,6 +98,7 @@ def test_marks_tell_an_offset_of_the_whole_print(relit, tmp_path):
         assert refused.code == 2 and re.search(words, refused.err) and not (tmp_path / "o").exists(), refused.err
 
 
+@pytest.mark.long
 def test_a_board_that_lies_on_its_face_and_elsewhere_is_the_same(relit, tmp_path):
     layer = write_layer(tmp_path / "paste.gbr", pads=[(0.05 - x, y - 0.03) for x, y in PADS])
     _, pads, _ = inspect(relit, printed(tmp_path / "b", surface(Print(shift=(2, 4e-5))), 3), "--paste", layer, "--side", "bottom",

@@ -163,7 +163,8 @@ def test_one_ball_does_not_place_lights(tmp_path):
     assert files_in(folder) == before
 
 
-@pytest.mark.parametrize("widened", [1.08, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1.15, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("widened", [1.08, 1.0, 1.15])
 def test_a_ball_whose_picture_is_an_ellipse_is_said_and_held(relit, tmp_path, widened):
     """As of images that were resized in one direction: its circle is 2.3 or 4.4 px off where the ellipse is farthest from it."""
     folder = photograph(tmp_path / "capture", "orthographic", chrome, widened=widened)
@@ -193,6 +194,7 @@ def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp
     assert json.loads((folder / "calibration.json").read_text())[f"{kind}-ball"]["warnings"] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"moved_px": 4}, "px aside from 009.exr to 011.exr of where it lies from 000.exr to 002.exr"),
     pytest.param({"camera": "perspective", "declared": {"projection": "orthographic"}}, "as a perspective camera sees it 13° off its axis",

@@ -10,6 +10,7 @@ from service.calibrate.lights import mirror_ball
 from service.requests.base.option_values import Circle
 from service.requests.calibrate import MirrorBallRequest
 from stage.errors import CalibrationError
+from tests.marks import first_short
 from tests.reference.balls import render
 from tests.scenes.captures import angles_degrees, write_lit
 from tests.service.calibrate.solvers.balls import spread, unit
@@ -55,7 +56,7 @@ def measured(folder, circles=NAMED):
     return errors, np.array([light["uncertainty_degrees"] for light in lights]), [light["flags"] for light in lights]
 
 
-@pytest.mark.parametrize("room", [lamp(WINDOW, 12.0, 0.6), lamp(WINDOW, 12.0, 5.0), lamp(WINDOW, 3.0, 5.0)],
+@first_short("room", [lamp(WINDOW, 12.0, 0.6), lamp(WINDOW, 12.0, 5.0), lamp(WINDOW, 3.0, 5.0)],
                          ids=["window", "saturated window", "lamp of the room"])
 def test_a_light_of_the_room_is_not_the_lamp(tmp_path, room):
     """A light of the room is brighter or larger than the lamp, and stands still from frame to frame; a pixel is 2° of reflection."""
@@ -92,7 +93,7 @@ def test_what_mirrors_the_lamp_beside_it_is_held_by_sigma(tmp_path):
     assert np.delete(errors, 2).max() < 1.0
 
 
-@pytest.mark.parametrize("ambient", [0.03, 0.1])
+@first_short("ambient", [0.03, 0.1])
 def test_the_outline_is_found_where_the_rim_is_as_bright_as_the_wall(tmp_path, ambient):
     """The room in the ball has steeper slopes than parts of its rim, but no sharp ones. σ takes the outline as known to a pixel."""
     errors, sure_to, _ = measured(write(tmp_path / "ball", [image((lamp(d),), ambient) for d in DIRECTIONS]), circles=[])

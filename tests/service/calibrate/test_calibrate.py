@@ -218,6 +218,7 @@ def test_intensity_from_the_object_itself(relit, tmp_path):
     relit("calibrate", "intensity", other).refused("three/capture.json: frames: 3 distant lights: brightness")
 
 
+@pytest.mark.long
 def test_a_light_that_contradicts_the_others_has_no_strength_that_is_sure(relit, tmp_path):
     """The last frame shows the first light once more. A lamp of a quarter of the strength of the others is no contradiction; noise is half
     a percent of the brightest reading."""

@@ -13,6 +13,7 @@ from service.requests.chart import ChartKind, ChartRequest
 from stage.capture.capture import Capture
 from stage.colour.colour import rgb_matrix
 from stage.stack.correction import Correction
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, write_image
 from tests.scenes.chart import (
     CAMERA,
@@ -192,7 +193,7 @@ LONG_SEARCHED = list(UNREADABLE)[-3:]
 @pytest.mark.long
 @pytest.mark.parametrize(("words", "placed"), [
     *((words, words in LONG_SEARCHED) for words in UNREADABLE),
-    *(pytest.param(words, False, marks=pytest.mark.long) for words in LONG_SEARCHED)])
+    *((words, False) for words in LONG_SEARCHED)])
 def test_a_chart_that_cannot_be_read_is_refused_with_one_sentence_and_nothing_is_written(relit, tmp_path, words, placed):
     shown = picture(seen(), POSE)
     folder = shoot(tmp_path / "cap", [UNREADABLE[words](shown)], saturation=0.999)
@@ -283,7 +284,7 @@ def test_lamps_of_several_primaries_have_a_matrix_each_and_a_narrow_one_is_refus
     assert (folder / "capture.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("gap", [0.79, 0.94])
+@first_short("gap", [0.79, 0.94])
 def test_charts_with_other_gaps_are_found(gap, tmp_path):
     shown = picture(seen(), POSE, patch=47 * gap)
     found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))

@@ -125,6 +125,7 @@ def test_a_grey_ball_measures_colours_powers_and_responses(relit, tmp_path):
         stage.irradiance[1].sum() / stage.irradiance[[0, 2, 3]].sum(axis=(1, 2)).mean(), rel=0.02)
 
 
+@pytest.mark.long
 def test_a_mirror_ball_and_a_card_measure_the_same(relit, tmp_path):
     """The lamps are lobes of 3 degrees; a card that is tilted away by 25 degrees sees those that its normal is near to."""
     stage = make_stage(2, 21)

@@ -20,6 +20,7 @@ from service.requests.base.import_choices import ImportChoices
 from stage.capture.light import PLACEHOLDER
 from stage.capture.manifest import read_manifest
 from stage.errors import ImageError, ManifestError
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
 
@@ -65,7 +66,7 @@ def test_it_finds_what_a_check_finds(registered):
     assert check(sky, environment=True, root=root) == admit_environment(sky, max_pixels=PIXELS)
 
 
-@pytest.mark.parametrize(("changes", "faults"), [
+@first_short(("changes", "faults"), [
     ({"mask": 3, "saturation": 0}, ["capture.json: mask: is 3: ", "capture.json: saturation: is 0: "]),
     ({"mask": "nothing.png"}, ["capture.json: mask: nothing.png is not in the folder"])])
 def test_faults_are_in_one_line_without_the_folder(tmp_path, changes, faults):
@@ -158,7 +159,7 @@ check_process.main()"""
         assert check(tmp_path / "cap")["frames"] == 5
 
 
-@pytest.mark.parametrize(("name", "layout", "content"), [
+@first_short(("name", "layout", "content"), [
     ("dome.lp", "lp", "1\n../outside.png 0 0 1\n"),
     ("dome.relight", "relightlab", json.dumps({"folder": "nothing", "images": [
         {"filename": "../outside.png", "direction": {"x": 0, "y": 0, "z": 1}}]}))])

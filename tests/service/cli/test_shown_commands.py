@@ -62,6 +62,7 @@ def test_the_commands_of_colour_run(relit, tmp_path, monkeypatch):
     assert len(commands) == 9 and {"a.0001.exr", "a.0001.png", "sheet.png", "lights.png", "maps.exr", "chart.png"} <= made
 
 
+@pytest.mark.long
 def test_the_commands_of_publish_and_blender_run(relit, tmp_path, monkeypatch):
     write_small_owl(tmp_path / "samples" / "owl", SMALL_SIDE)
     monkeypatch.chdir(tmp_path)

@@ -12,6 +12,7 @@ from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.errors import ManifestError, ResultError, ScanError
+from tests.marks import first_short
 from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_mesh, write_scan, write_stl
 
 REGIONS = [{"name": "top", "facing": [0, 0, 1], "tolerance": [-0.08, 0.08]},
@@ -117,7 +118,8 @@ def test_a_datum_carries_the_scan(tmp_path, part):
     assert any("the datum regions leave 3 of 6 motions" in said for said in result.warnings)  # not the surface, as that of a cylinder
 
 
-@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.long), 1.003])
+@pytest.mark.long
+@pytest.mark.parametrize("factor", [1.0, 1.003])
 def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
     """A dent of .15 mm does not make the scan smaller, and does not hide that it is larger: the factor is known to .0001."""
     made, design = part
@@ -132,9 +134,9 @@ def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
         assert any("1.0030" in words and "times as large" in words for words in result.warnings)
 
 
-@pytest.mark.parametrize(("sides", "radius", "factor"), [
-    (256, 15.0, 1.003), pytest.param(256, 15.0, 0.998, marks=pytest.mark.long),
-    (256, 15.1, 1.0), pytest.param(24, 15.0, 1.0, marks=pytest.mark.long)])
+@first_short(("sides", "radius", "factor"), [
+    (256, 15.0, 1.003), (256, 15.0, 0.998),
+    (256, 15.1, 1.0), (24, 15.0, 1.0)])
 def test_what_is_larger_across_and_not_along_is_no_size_of_the_whole(tmp_path, sides, radius, factor):
     """A bar that is too thick and exactly as long, and a design with flats in place of the round, are no error of the scanner."""
     seen = scan_of(cylinder(256, radius), np.random.default_rng(6), 6000)
@@ -181,6 +183,7 @@ def test_scans_of_something_else_are_refused(tmp_path, part):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_what_stands_on_a_region_keeps_it_from_passing(tmp_path, part):
     """A peg of 3 mm across and 12 mm high, whose points do not belong to the design, is less than a hundredth of the top."""
     made, design = part
@@ -204,6 +207,7 @@ def test_wrong_regions_are_named(tmp_path, part, entry, field):
         compare(request(tmp_path, tmp_path / "none.ply", part[1], regions=regions(tmp_path, [{**REGIONS[0], **entry}])))
 
 
+@pytest.mark.long
 def test_bare_points_have_the_side_from_which_they_were_seen(tmp_path):
     """The rims of a round body turn away from who saw it; points from all around say nothing."""
     made = cylinder()
@@ -229,7 +233,7 @@ def box(x, y, z) -> Part:
                                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
 
 
-@pytest.mark.parametrize(("thick", "depth"), [(1, 0.7), (3, 2.5)])
+@first_short(("thick", "depth"), [(1, 0.7), (3, 2.5)])
 def test_the_floor_of_a_pocket_near_the_other_side_of_a_wall_is_not_overlooked(tmp_path, thick, depth):
     made = box(80, 50, thick)
     scan = scan_of(made, np.random.default_rng(7), 40_000, None, None,
@@ -288,7 +292,7 @@ def test_inputs_that_say_no_outside_or_no_σ_are_refused(tmp_path, part):
         compare(request(tmp_path, scan, concave))
 
 
-@pytest.mark.parametrize("sigma", [SIGMA_M, None])
+@first_short("sigma", [SIGMA_M, None])
 def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part, sigma):
     made, design = part
     plain = scan_of(made, np.random.default_rng(7), 5000)

@@ -9,6 +9,7 @@ import pytest
 from stage.formats import exr
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
+from tests.marks import first_short
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
 from tests.scenes.depth import AMBIENT, BLACK_WHITE, NORMAL, POSE, PROJECTOR, gray_patterns, make_scene, phase_patterns, write_patterns
 
@@ -217,7 +218,7 @@ def test_saturated_readings_are_refused(relit, tmp_path):
     assert report["pixels"]["saturated"] > 0 and not maps.mask[bright & LIT].any()
 
 
-@pytest.mark.parametrize("patterns", [[*phase_patterns("column", 16), *gray_patterns("column", stripe=4)],
+@first_short("patterns", [[*phase_patterns("column", 16), *gray_patterns("column", stripe=4)],
                                       [*gray_patterns("column", stripe=4), *gray_patterns("row", stripe=4)]])
 def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], noise=0.01)

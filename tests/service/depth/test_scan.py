@@ -95,6 +95,7 @@ def test_waveforms_give_several_returns(tmp_path):
     assert np.median(np.abs(np.sort(distance) - np.sort(wanted))) < 0.02
 
 
+@pytest.mark.long
 def test_scaled_waveforms_have_the_same_points_and_a_sentence(tmp_path):
     """Ten units a photon: taken for photons, noise of the background gives as many points again."""
     n = 400

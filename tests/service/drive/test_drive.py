@@ -114,6 +114,7 @@ def test_eight_bits_add_little(drive, tmp_path):
     assert rms(*light) < 0.005
 
 
+@pytest.mark.long
 def test_a_sun_beyond_the_lamps_is_dilated_as_little_as_can_be(drive, tmp_path):
     directions = fibonacci_sphere(331)
     write_rig(tmp_path / "rig.json", directions, irradiance=0.03, bits=16)
@@ -141,6 +142,7 @@ def test_a_turning_sky_makes_no_lamp_jump(drive, tmp_path):
     assert 0 < change["largest_of_a_level"] < 1.2 * change["largest_of_a_share"]
 
 
+@pytest.mark.long
 def test_light_from_where_no_lamp_stands_is_moved_or_left_out(drive, tmp_path):
     directions = fibonacci_sphere(200)
     front = directions[directions[:, 2] > 0]
@@ -153,7 +155,7 @@ def test_light_from_where_no_lamp_stands_is_moved_or_left_out(drive, tmp_path):
     assert lost == pytest.approx(report["limits"]["beyond_share"], abs=0.01)
 
 
-@pytest.mark.parametrize("exposure", ["0", "-2"])
+@first_short("exposure", ["0", "-2"])
 def test_colours_that_the_lamps_lack_are_said_as_a_part_of_the_light(relit, tmp_path, exposure):
     """Red lamps alone under white light: two thirds are missing, whatever the exposure."""
     write_rig(tmp_path / "rig.json", fibonacci_sphere(32), primaries={"red": (1.0, 0.0, 0.0)})

@@ -57,7 +57,7 @@ def test_better_than_the_depth_and_no_worse_than_the_normals(device, shape, nois
     assert within >= 0.95  # 0.9973 for a Gaussian of independent errors; those of neighbours are alike
 
 
-@pytest.mark.parametrize("perspective", [False, True])
+@first_short("perspective", [False, True])
 def test_a_tilted_disc_before_a_plane_keeps_both_and_their_distance(device, perspective):
     view = see("disc", perspective=perspective)
     joined, _ = join(view, noise=0.5, drift=0, sigma=0.5 * MM, device=device)
@@ -91,7 +91,8 @@ def test_a_depth_that_is_worse_than_its_sigma_says_neither_bends_normals_nor_is_
     assert np.median(error / joined.sigma[sure]) < 1.4 and np.mean(error > 5 * joined.sigma[sure]) < 0.1
 
 
-@first_short("factor", [1.0, 0.7, 1.3])
+@pytest.mark.long
+@pytest.mark.parametrize("factor", [1.0, 0.7, 1.3])
 def test_normals_that_are_too_flat_or_too_steep_everywhere_get_the_relief_of_the_depth(device, factor):
     """Slopes of 0.7 or 1.3 times the true ones, which are 4 to 5° off; what is left is the noise of 0.5° and drift of 1°."""
     given = drifting(WAVE.normal, noise=NOISE, drift=1) * np.array([factor, factor, 1.0])[:, None, None]
@@ -117,6 +118,7 @@ def test_a_bent_depth_that_contradicts_the_normals_is_said_and_held(device, wron
     assert said or np.median(joined.sigma) < 0.2 * SIGMA
 
 
+@pytest.mark.long
 def test_a_relief_that_is_too_deep_is_held(device):
     depth = 0.5 + 1.15 * (-WAVE.z - 0.5) + SIGMA * np.random.default_rng(1).standard_normal(WAVE.z.shape)
     joined, _ = join(WAVE, noise=0.5, drift=1, sigma=SIGMA, device=device, depth=depth)
@@ -158,7 +160,7 @@ def test_pixels_without_depth_beside_a_step_are_not_taken_for_sure(device):
     assert joined.guessed.mean() < 0.05
 
 
-@pytest.mark.parametrize("perspective", [False, True])
+@first_short("perspective", [False, True])
 def test_where_there_is_a_depth_none_beside_a_step_is_worse(device, perspective):
     """A tenth of the depths is missing; pixels with one are right on both sides of the step, and only guessed ones are far off."""
     view = see("disc", perspective=perspective)
@@ -182,7 +184,7 @@ def test_mixtures_at_an_outline_are_left_out(device):
     assert len(np.unique(joined.part[joined.placed])) == 2
 
 
-@pytest.mark.parametrize(("count", "perspective"), [(0, True), (1, True), (1, False), (40, True)])
+@first_short(("count", "perspective"), [(0, True), (1, True), (1, False), (40, True)])
 def test_single_depths_that_are_far_off_are_rejected(device, count, perspective):
     view = see("wave", size=SIZE, perspective=perspective)
     random = np.random.default_rng(1)
@@ -196,7 +198,7 @@ def test_single_depths_that_are_far_off_are_rejected(device, count, perspective)
     assert np.sqrt(np.mean((joined.height - view.z)[sure] ** 2)) < LEAST_RATIO * SIGMA
 
 
-@pytest.mark.parametrize(("share", "off"), [(0.1, 3 * MM), (0.2, 3 * MM), (0.3, 3 * MM), (0.3, -2 * MM)])
+@first_short(("share", "off"), [(0.1, 3 * MM), (0.2, 3 * MM), (0.3, 3 * MM), (0.3, -2 * MM)])
 def test_σ_holds_depths_that_are_off_to_one_side_and_too_near_to_be_rejected(device, share, off):
     view = see("wave", size=SIZE)
     random = np.random.default_rng(4)
@@ -208,6 +210,7 @@ def test_σ_holds_depths_that_are_off_to_one_side_and_too_near_to_be_rejected(de
     assert (np.abs(joined.height - view.z) <= 3 * joined.sigma)[sure].mean() >= 0.95  # as of right depths
 
 
+@pytest.mark.long
 def test_what_normals_leave_unexplained_tells_a_mirrored_view(device):
     view = see("wave")
     right, _ = join(view, noise=0.5, drift=2, sigma=0.2 * MM, device=device)
@@ -270,7 +273,7 @@ def write(folder: Path, *, perspective: bool = True, shape: str = "wave", mirror
     return folder / "solved", folder / "depth", view.z, view.normal
 
 
-@pytest.mark.parametrize("perspective", [True, False])
+@first_short("perspective", [True, False])
 def test_the_joined_surface_is_better_than_both(relit, tmp_path, perspective):
     solved, depth, z, normal = write(tmp_path, perspective=perspective)
     outcome = relit.done("join", solved, depth, "--out", tmp_path / "joined")

@@ -20,6 +20,7 @@ from stage.capture.light import DistantLight, PointLight
 from stage.colour.colour import convert
 from stage.colour.colour_spaces import linear_space
 from stage.errors import CalibrationError
+from tests.marks import first_short
 from tests.reference.balls import lambertian, lambertian_near, render
 from tests.scenes.captures import angles_degrees
 from tests.service.calibrate.solvers.balls import HEIGHT, ORTHOGRAPHIC, PERSPECTIVE, SCENES, WIDTH, box, spread, unit
@@ -160,7 +161,7 @@ def distant(direction):
     return DistantLight(type="distant", direction=tuple(direction), irradiance=(1, 1, 1))
 
 
-@pytest.mark.parametrize("name", SCENES)
+@first_short("name", SCENES)
 def test_brightness_of_far_lights(name):
     """Exact but for the curvature of the ball inside a pixel: (1/60)²/24 of the shading, 1e-5."""
     view, geometry = exact(name)

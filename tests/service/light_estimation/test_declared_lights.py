@@ -11,6 +11,7 @@ from service.relight.relight import relight
 from service.requests.basis import BasisRequest
 from service.requests.captures import InfoRequest
 from service.requests.relight import RelightRequest
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture, write_exr
 from tests.scenes.ellipsoid import ellipsoid
 
@@ -40,7 +41,7 @@ def test_axes_along_which_nothing_faces_the_camera_are_named(tmp_path, axis):
         assert len(said) == 1 and f"with {axis} as the axis towards the camera, 100 % face it" in said[0]
 
 
-@pytest.mark.parametrize(("signs", "words"), [([1, -1, 1], "the axes look mirrored: with y negated"),
+@first_short(("signs", "words"), [([1, -1, 1], "the axes look mirrored: with y negated"),
                                               ([-1, -1, 1], "along the outline the normals point inwards"), ([1, 1, 1], None)])
 def test_axes_under_which_the_normals_are_of_no_surface_that_stands_free_are_named(tmp_path, signs, words):
     """Lights with y down, or turned by 180°, explain every reading of a matt object as well as the right ones."""

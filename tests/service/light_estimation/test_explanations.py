@@ -7,6 +7,7 @@ from service.light_estimation.declared_lights import explanation_sentence
 from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest
 from service.light_estimation.lambertian import FACING, suspects
 from stage.transforms import fibonacci_sphere
+from tests.marks import first_short
 from tests.reference.microfacet import specular, unit
 
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -19,8 +20,8 @@ def sample_of(readings, lights):
                   tuple(f"{number:03d}.exr" for number in range(count)))
 
 
-@pytest.mark.parametrize("ball", [60, 100])
-@pytest.mark.parametrize("alpha", [0.16, 0.3])
+@first_short("ball", [60, 100])
+@first_short("alpha", [0.16, 0.3])
 def test_a_ball_before_a_metal_plane_tells_that_lights_are_right(ball, alpha):
     """Any brightness of each light, and any directions, explain the readings of a metal plane, whose Lambertian normals scatter. The ball
     refutes them."""
@@ -60,7 +61,7 @@ def test_what_fits_beside_metal_tells_that_axes_are_right():
 
 
 @pytest.mark.parametrize(("first", "factor"), [(12, 0.5), (18, 1.5), (12, 0.8)])
-@pytest.mark.parametrize("gloss", [0.0, 0.3])
+@first_short("gloss", [0.0, 0.3])
 def test_an_exposure_that_changes_is_named_with_its_image(first, factor, gloss):
     """Readings of a matt and a glossy ball, of 1 % noise, whose images are brighter or darker from one on."""
     readings, lights = ball(gloss)
@@ -165,7 +166,7 @@ def coin(roughness, dielectric, count=40):
 
 
 @pytest.mark.parametrize("roughness", [0.3, pytest.param(0.5, marks=pytest.mark.long)])
-@pytest.mark.parametrize("dielectric", [True, False])
+@first_short("dielectric", [True, False])
 def test_a_coin_whose_highlight_is_smooth_over_the_lights_is_accused_of_nothing(roughness, dielectric):
     readings, lights = coin(roughness, dielectric)
     sample = sample_of(readings, lights)

@@ -49,6 +49,7 @@ def stated(*given):
     return uncertainty_of(*given, light_from_elsewhere(*given))
 
 
+@pytest.mark.long
 def test_noise_is_averaged_and_stated():
     """1 % of the brightest reading, 1500 pixels: each light's mean is known to 0.1 %; the stated error is of that size."""
     directions, irradiance, readings, _ = scene(20, 0.3)
@@ -132,7 +133,7 @@ def test_a_light_that_nothing_shows_is_left_out_of_the_others():
         fit_intensities(readings[2:6], np.ones((4, readings.shape[1]), bool), directions[2:6])
 
 
-@pytest.mark.parametrize("part", [1 / 30, 1 / 10, 0])
+@first_short("part", [1 / 30, 1 / 10, 0])
 def test_a_dim_light_is_told_from_one_that_does_not_burn(part):
     """Noise is a thousandth of the bright readings: a thirtieth is known to 3 % of itself a reading, and no pixel shows a dark light."""
     directions, irradiance, readings, _ = scene(8, 0.8)

@@ -51,6 +51,7 @@ def test_each_light_is_shown_as_the_basis_has_it(relit, tmp_path, owl):
         assert levels_rms(found, truth).max() < 2
 
 
+@pytest.mark.long
 def test_lights_close_to_one_another_show_their_own_images(relit, tmp_path):
     """Seven lights within 8 degrees, whose images differ little; those of their neighbours are farther than the limit."""
     scene = capture(tmp_path / "cap")
@@ -93,6 +94,7 @@ def test_black_stays_black_and_the_scale_is_told(relit, tmp_path):
     assert 255 * corner.max() < 1.5  # a step of JPEG
 
 
+@pytest.mark.long
 def test_lights_in_pairs_show_their_images_and_something_between(relit, tmp_path):
     """Their Gaussians are as wide as the distances between the pairs ask for."""
     scene = capture(tmp_path / "cap", lights=4)

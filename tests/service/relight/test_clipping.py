@@ -72,6 +72,7 @@ def test_what_is_clipped_at_every_exposure_is_said(relit, capture):
     assert [warning.removeprefix("warning  ")] == json.loads(report.read_text())["warnings"]
 
 
+@pytest.mark.long
 def test_a_model_that_is_brighter_fills_clipped_readings_in(relit, capture):
     """With true maps, but for the lobe that is widened as guided lobes are."""
     truth, _ = relight(relit, capture, capture / "a", "--weights", "smooth")

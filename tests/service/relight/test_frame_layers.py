@@ -14,6 +14,7 @@ from stage.capture.camera import Camera
 from stage.colour.colour import rgb_matrix
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, files_in, make_scene, write_capture, write_exr
 from tests.scenes.coverage import render_covered, write_covered
 
@@ -104,7 +105,7 @@ def test_other_programs_find_the_layers(lit):
                      "depth": (("depth.Z",), "data", -1)}
 
 
-@pytest.mark.parametrize(("options", "several"), [
+@first_short(("options", "several"), [
     (("--aov", "normal"), False), (("--aov", "normal", "--parts", "multi"), True), (("--compression", "dwaa"), False),
     (("--compression", "dwaa", "--aov", "diffuse"), False), (("--compression", "dwaa", "--aov", "mask"), True),
     (("--compression", "piz", "--aov", "mask"), False)])
@@ -113,7 +114,7 @@ def test_layers_have_parts_where_the_beauty_is_lossy(lit, options, several):
         assert (len(file.parts) > 1) == several
 
 
-@pytest.mark.parametrize("guided", [False, True])
+@first_short("guided", [False, True])
 def test_layers_of_lights_add_up_to_the_beauty(lit, tmp_path, guided):
     options = ("--keys", tmp_path / "keys.json", "--frames", "1-2")
     out = lit("f", *options, "--aov", "lights", maps=guided)

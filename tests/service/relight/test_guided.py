@@ -9,6 +9,7 @@ import pytest
 from service.relight.model_range import LitModel, correction
 from service.reporting.provenance import HASHING
 from stage.stack.ingest import LAYOUT
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
@@ -48,7 +49,7 @@ def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
     assert guided < 0.5 * min(plain, kernel)
 
 
-@pytest.mark.parametrize("wrong", ["normals", "gloss"])
+@first_short("wrong", ["normals", "gloss"])
 def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
     """Normals that all face the camera, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain
     sum's. Turned normals are refused."""
@@ -134,6 +135,7 @@ def test_maps_of_a_version_that_hashed_otherwise_guide_with_a_warning(relit, sce
     assert np.array_equal(rgb(tmp_path / "one.1.exr"), rgb(tmp_path / "other.1.exr"))
 
 
+@pytest.mark.long
 def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
     """A manifest that was corrected after the solve: what `P` and the cameras of frames say did not fit together."""
     folder, _ = scene
@@ -145,6 +147,7 @@ def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
     assert "another camera.pixel_size_m than" in relit(words[0], copy, *words[2:], "--out", tmp_path / "b.#.exr").out
 
 
+@pytest.mark.long
 def test_maps_that_were_solved_with_other_lights_guide_and_are_exported_with_a_warning(relit, scene, tmp_path):
     """Lights that were corrected in the manifest after the solve; beside it the same lights."""
     folder = shutil.copytree(scene[0], tmp_path / "scene")

@@ -75,6 +75,7 @@ def test_frames_are_those_made_alone(relit, scene, tmp_path):
         assert not np.array_equal(together[number], alone)  # they are made in two ways
 
 
+@pytest.mark.long
 def test_the_specular_layer_is_that_of_a_frame_alone(relit, scene, tmp_path):
     relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--aov", "diffuse,specular")
     relight(relit, scene, tmp_path / "b", "--frames", "1", "--aov", "diffuse,specular")
@@ -112,6 +113,7 @@ def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
     assert SURFACE.off(together[1], truth) < 1.02 * SURFACE.off(alone[1], truth)
 
 
+@pytest.mark.long
 def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monkeypatch):
     """Batches of 128 pixels in portions of 32: to half and the order of float32 sums."""
     whole = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
@@ -122,6 +124,7 @@ def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monke
         np.testing.assert_allclose(parts[number], whole[number], rtol=2 * HALF, atol=1e-5)
 
 
+@pytest.mark.long
 def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tmp_path, monkeypatch):
     """With them, the frames are the same to half and the order of float32 sums."""
     asked = []

@@ -20,6 +20,7 @@ from service.requests.base.base import Role
 from service.requests.base.options import role_of
 from service.requests.relight import RelightRequest
 from stage.formats import exr
+from tests.marks import first_short
 from tests.scenes.captures import edit_frame, files_in, make_scene, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=8, lights=5)
@@ -76,7 +77,7 @@ def test_a_frame_with_one_changed_byte_is_made_again(made, tmp_path):
     assert made() == set()
 
 
-@pytest.mark.parametrize("options", [
+@first_short("options", [
     ("--exposure", "1"), ("--compression", "piz"), ("--color-space", "lin_ap1_scene"), ("--aov", "mask"), ("--weights", "smooth"),
 ])
 def test_another_request_makes_frames_anew(made, options):
@@ -165,7 +166,7 @@ main()
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGTERM", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_interrupted_in_the_middle_and_run_again(relit, tmp_path, name):
     cap, out = write_capture(tmp_path / "cap", SCENE), tmp_path / "f"
     sky = write_exr(tmp_path / "sky.exr", np.random.default_rng(1).random((8, 16, 3)))

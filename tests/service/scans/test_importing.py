@@ -83,6 +83,7 @@ def test_the_direction_to_the_scanner(views):
     assert not found.place.any() and found.spread_degrees == 0
 
 
+@pytest.mark.long
 def test_a_flat_wall_has_two_sides_unless_its_normals_tell():
     random = np.random.default_rng(3)
     wall = np.column_stack([random.uniform(-1, 1, (3000, 2)), 0.002 * random.normal(size=3000)])

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.scans.points.ply_points import PlyPoints, read_ply_points
+from tests.marks import first_short
 
 MAP = np.array([450123.0, 5201234.0, 431.0])
 POINTS = np.rint(2**13 * np.random.default_rng(3).uniform(0, 1, (400, 3)) * [1, 0.7, 0.05]) / 2**13
@@ -96,7 +97,7 @@ def placed(folder: Path, entries: list[dict]) -> list[np.ndarray]:
     return [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(clouds, poses, strict=True)]
 
 
-@pytest.mark.parametrize("applied", [False, True], ids=["poses", "points"])
+@first_short("applied", [False, True], ids=["poses", "points"])
 def test_scans_with_poses_on_a_map_are_counted_from_among_their_places(relit, tmp_path, applied):
     """In the frames of the scanners, or with the poses applied already: a mesh has floats of 32 bits."""
     for number, pose in enumerate(stations()):
@@ -116,7 +117,7 @@ def test_scans_with_poses_on_a_map_are_counted_from_among_their_places(relit, tm
     assert "warning" not in said
 
 
-@pytest.mark.parametrize("applied", [False, True], ids=["frames of scanners", "one frame"])
+@first_short("applied", [False, True], ids=["frames of scanners", "one frame"])
 def test_poses_that_are_all_the_identity_do_not_put_scanners_at_the_origin(relit, tmp_path, applied):
     """Programs write such poses for scans that lie in one frame; the origin is within the ball."""
     for number, pose in enumerate(stations()):

@@ -146,6 +146,7 @@ def test_starts_decide_where_the_surface_does_not(relit, tmp_path):
     assert "has no two scans with a pose" in relit.refused("register", folder, "--out", tmp_path / "no", "--starts")
 
 
+@pytest.mark.long
 def test_wrong_depths_do_not_refuse_a_start_that_decides(relit, tmp_path):
     """A disc of the surface is measured 40 mm before itself, as in folds that light bounces in: 2 % of the pixels of a scan."""
     seen = list(views(figure, 0, 30))
@@ -193,6 +194,7 @@ def test_a_wrong_axis_of_a_turntable_is_named(relit, tmp_path):
     assert "may be wrong" not in outcome.out + outcome.err
 
 
+@pytest.mark.long
 def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
     seen = views(figure, 0, 30, 60)
     folder = write(tmp_path / "set", seen, top=table_of(seen, 0, 30, 60))
@@ -228,10 +230,10 @@ def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("change", "sentence"), [
-    pytest.param(lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored", marks=pytest.mark.long),
+    (lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored"),
     (lambda points: points * 1000, "the others if its coordinates are multiplied by 0.001, as if"),
-    pytest.param(lambda points: points * 1.01, "s3: is about 0.", marks=pytest.mark.long),
-    pytest.param(lambda points: points[:, [0, 2, 1]] * [1, 1, -1] * [1, 1, 0.3], "s3: has no pose", marks=pytest.mark.long),
+    (lambda points: points * 1.01, "s3: is about 0."),
+    (lambda points: points[:, [0, 2, 1]] * [1, 1, -1] * [1, 1, 0.3], "s3: has no pose"),
 ], ids=["mirrored", "millimetres", "one per cent", "squeezed"])
 def test_a_scan_that_does_not_belong_is_named(relit, tmp_path, change, sentence):
     seen = views(figure, 0, 30, 60, 45)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from service.sequences.agreement import advance, agree, begin, noise_share, steady
+from tests.marks import first_short
 
 SIDE = 96
 ALL = np.ones((SIDE, SIDE), bool)
@@ -62,7 +63,7 @@ def test_no_motion_makes_the_mean_worse_than_a_step_alone(speed, declared):
         assert mean < 1.005 * alone
 
 
-@pytest.mark.parametrize(("side", "speed", "before", "bound"), [(3, 0.1, 0.28, 0.08), (5, 0.3, 0.15, 0.05), (9, 1.0, 0.03, 0.015)])
+@first_short(("side", "speed", "before", "bound"), [(3, 0.1, 0.28, 0.08), (5, 0.3, 0.15, 0.05), (9, 1.0, 0.03, 0.015)])
 def test_sigma_holds_by_how_much_the_mean_of_a_small_thing_that_moves_slowly_lags(side, speed, before, bound):
     """A square of some pixels that moves by a part of σ a step, for 40 steps: pixels beyond five σ. `before`: their share without the mean
     of the last steps; the bounds are twice and more what is left of it (.028, .016, .005)."""

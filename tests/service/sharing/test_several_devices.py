@@ -109,6 +109,7 @@ def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces, device, p
     assert found["device"].count(device) == 2
 
 
+@pytest.mark.long
 def test_an_error_on_one_device_ends_the_solve(tmp_path, small_pieces, pair, monkeypatch):
     calls, whole = [], material.solve_svbrdf
 

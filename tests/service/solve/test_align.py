@@ -63,6 +63,7 @@ def test_the_report_and_the_maps_say_that_frames_were_aligned(relit, tmp_path):
     assert len([name for name in files_in(tmp_path / ".relit") if name.endswith("json") and "stack" in name]) == 2
 
 
+@pytest.mark.long
 def test_another_time_may_be_named(relit, tmp_path):
     write_moving(tmp_path, GLIDING)
     relit.done("solve", tmp_path, "--align-to", "10.exr", "--method", "lambert", "--out", tmp_path / "out")
@@ -72,6 +73,7 @@ def test_another_time_may_be_named(relit, tmp_path):
     assert json.loads((tmp_path / "out" / "report.json").read_text())["motion"]["reference"] == "10.exr"
 
 
+@pytest.mark.long
 def test_a_relit_frame_shows_the_common_time(relit, tmp_path):
     frames = {}
     write_exr(tmp_path / "even.exr", np.ones((8, 16, 3)))

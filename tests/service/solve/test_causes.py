@@ -10,6 +10,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.formats import images
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.scenes import captures
 
 
@@ -68,6 +69,7 @@ def test_saturation_and_shadow_are_told_apart(tmp_path, scene):
     assert sum(report["pixels"][s.name.lower()] for s in Status) == report["pixels"]["mask"]
 
 
+@pytest.mark.long
 def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     """Noise as strong as the light: the normals are given, as ambiguous, and as unsure where σ is above what was asked for."""
     folder = captures.write_capture(tmp_path / "capture", scene)
@@ -90,7 +92,7 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     assert np.array_equal(some.maps.mask, written.mask)
 
 
-@pytest.mark.parametrize(("lights", "exposures", "method"), [(5, 3, "robust"), (14, 1, "svbrdf")])
+@first_short(("lights", "exposures", "method"), [(5, 3, "robust"), (14, 1, "svbrdf")])
 def test_exposures_of_one_light_do_not_make_a_capture_one_of_many_lights(tmp_path, lights, exposures, method):
     """Fifteen images of five lights say no more about a material than five do."""
     folder = captures.write_capture(tmp_path / "capture", captures.make_scene(size=16, lights=lights))

@@ -19,7 +19,7 @@ def waves(rows: int, cols: int, lights: int) -> Scene:
     return Scene(normal, albedo, np.ones((rows, cols), bool), directions, irradiance, render(normal, albedo, directions, irradiance))
 
 
-@pytest.mark.parametrize("shape", [(1, 37), (37, 1), (2, 40), (40, 2)])
+@first_short("shape", [(1, 37), (37, 1), (2, 40), (40, 2)])
 @pytest.mark.parametrize("method", ["lambert", "robust"])
 def test_thin_images_are_solved(relit, tmp_path, shape, method):
     scene = waves(*shape, 9)
@@ -57,7 +57,7 @@ def test_images_that_determine_no_lights(relit, tmp_path, images):
     assert outcome.out or ("--lights unknown" in outcome.err and not (tmp_path / "out").exists())
 
 
-@pytest.mark.parametrize(("width", "said"), [(1, True), (2, True), (5, False)])
+@first_short(("width", "said"), [(1, True), (2, True), (5, False)])
 def test_wires_are_said(relit, tmp_path, width, said):
     """A bar that leaves the object, whose pixels mix with what lies behind it where it is thin."""
     scene = waves(60, 80, 7)

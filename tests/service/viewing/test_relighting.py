@@ -82,7 +82,7 @@ def test_a_captured_light_is_a_light_from_its_direction(full):
         assert np.flatnonzero(directions[:, 2] > 0.6)[np.argmin(errors)] == light and min(errors) < 0.15
 
 
-@pytest.mark.parametrize("sky", ["even", "lamp", "halves"])
+@first_short("sky", ["even", "lamp", "halves"])
 def test_an_environment_through_the_table_is_that_of_relight(folder, full, sky):
     """The weights of `relit relight` may not be negative, in whole for an environment and here for each direction of the grid, so that sums
     differ by some per cent of the picture; under light from all around by nearly nothing, as both keep the energy."""

@@ -133,6 +133,7 @@ def test_a_frame_or_a_mask_that_cannot_be_used_is_said_and_the_others_are_shown(
     assert atlas(tmp_path / "out").max() <= 1
 
 
+@pytest.mark.long
 def test_ambient_light_is_shown_and_does_not_darken_the_exposure(tmp_path, relit):
     scene = make_scene(lights=4)
     write_capture(tmp_path / "cap", scene)

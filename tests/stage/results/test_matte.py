@@ -7,6 +7,7 @@ import pytest
 from stage.capture.capture import Capture
 from stage.results.matte import Matte, MatteSource, matte_of
 from stage.stack.ingest import open_stack
+from tests.marks import first_short
 from tests.scenes.coverage import Covered, render_covered, write_covered
 
 
@@ -25,8 +26,8 @@ def edge_error(scene: Covered, coverage, grey=None, factor=None):
     return (np.abs(over - truth)[partly] / grey).mean()
 
 
-@pytest.mark.parametrize(("options", "most"), [
-    ({}, 0.05), pytest.param({"lights": 96, "size": 64}, 0.05, marks=pytest.mark.long), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
+@first_short(("options", "most"), [
+    ({}, 0.05), ({"lights": 96, "size": 64}, 0.05), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
 ], ids=["lights around", "many lights", "lights in front", "a hole"])
 def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options, most):
     """The limits are what shading that changes within a pixel of the rim leaves open: more where no light comes from the side."""
@@ -88,6 +89,7 @@ def test_a_lit_wall_with_moving_shadows_is_kept(tmp_path):
     assert matte.source is MatteSource.BACKGROUND and (matte.coverage == 1).all() and (matte.factor == 1).all()
 
 
+@pytest.mark.long
 def test_a_wall_beside_a_part_of_the_object_has_a_hard_border(tmp_path):
     scene, lit = render_covered(), render_covered(background=0.4)
     rows = np.arange(48) < 18  # the upper part of the ellipse

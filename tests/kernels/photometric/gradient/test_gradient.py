@@ -77,7 +77,7 @@ def rounding_bound(shading: np.ndarray, frames) -> np.ndarray:
     return np.degrees(1.5 * HALF_ROUNDING * np.linalg.norm(np.abs(inverse[1:]) @ shading, axis=0))
 
 
-@pytest.mark.parametrize("name", SETS)
+@first_short("name", SETS)
 def test_a_lambertian_surface_is_exact(device, name):
     """Integrated over the sphere of light; the bound is half rounding alone and 0.01 degrees for the rest."""
     frames, normal = SETS[name], cap(70, 90)
@@ -119,7 +119,7 @@ def test_contradiction_and_occlusion_raise_the_standard_error(device):
     assert fit.length[2] == pytest.approx(0.9, abs=2e-3)
 
 
-@pytest.mark.parametrize("f0", [0.04, 0.6])
+@first_short("f0", [0.04, 0.6])
 @first_short(("roughness", "lean"), [
     (0.1, (0.04, 0.03)), (0.3, (0.38, 1.37)), (0.7, (9.9, 16.2)),
 ])

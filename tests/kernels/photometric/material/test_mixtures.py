@@ -1,7 +1,6 @@
 """Two materials in a pixel, on readings that the independent float64 model mixes."""
 
 import numpy as np
-import pytest
 
 from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.mixtures import LEAST_SHARE, NO_PAIRS, choose_pairs, mix_materials, single_lobe
@@ -9,6 +8,7 @@ from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import COLOUR, render, sample, tilted
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 
 LAMBERT = LobeShape()
 GOLD = (0.95, 0.68, 0.35)
@@ -44,7 +44,7 @@ def solve(radiance, normal, device):
     return single, pairs, *mix_materials(samples, normal, single, pairs, shape=LAMBERT)
 
 
-@pytest.mark.parametrize(("metal_rough", "noise"), [(0.3, 0.0), (0.5, 0.0), (0.3, 0.02)])
+@first_short(("metal_rough", "noise"), [(0.3, 0.0), (0.5, 0.0), (0.3, 0.02)])
 def test_gold_on_paint(device, metal_rough, noise):
     """The share of gold is found where both materials are seen; one lobe misses that of most of these pixels by far. Tolerances: the shared
     gold is within a twentieth of F0 0.95; noise of 2 % hides lobes that reach few lights."""
@@ -72,8 +72,8 @@ def test_pure_pixels_among_them_are_not_split(device):
         np.testing.assert_array_equal(before[pure], after[pure])
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.03])
-@pytest.mark.parametrize("share", [0.0, 1.0])
+@first_short("noise", [0.0, 0.03])
+@first_short("share", [0.0, 1.0])
 def test_an_object_of_one_material_has_no_pairs(device, share, noise):
     """Nothing is split where no pixel needs two materials, so that nothing is paid either."""
     single, pairs, material, mixture = solve(*border(np.full(PIXELS, share), noise=noise), device)

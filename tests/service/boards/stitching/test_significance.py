@@ -24,6 +24,7 @@ def test_thresholds_are_those_of_the_normal_distribution():
     assert threshold(0.05, 10_000, sides=1) == pytest.approx(4.41717, abs=1e-4)
 
 
+@pytest.mark.long
 def test_noise_alone_gives_no_more_false_alarms_than_stated():
     """60 boards at 20 %: the bound allows 12 ± 3; overlapping windows give fewer."""
     alarms = sum(scan_windows(noise(seed), tolerance_m=0.0, false_alarm=0.2, smallest_px=2).significant.any() for seed in range(60))

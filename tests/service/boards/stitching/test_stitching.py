@@ -104,6 +104,7 @@ def test_pads_of_one_pitch_are_not_aliased_quietly():
         stitch(points(views_of(surface, stage=1.5e-4, seed=4)), shift_sigma_m=1.5e-4)
 
 
+@pytest.mark.long
 def test_one_place_that_does_not_repeat_settles_pads_of_one_pitch():
     """A taller dome in every overlap but one; the loop of the others tells where the last pair belongs."""
     pads = domes(4e-3, 4e-3, jitter=0.0)
@@ -182,6 +183,7 @@ def test_vertical_walls_place_tiles_to_a_part_of_a_pixel_and_sigma_says_it():
     assert np.median(over) < 1 and np.percentile(over, 95) < 4.5
 
 
+@pytest.mark.long
 def test_a_tile_that_is_noisier_than_the_others_is_named_and_has_a_wider_sigma():
     """Noise of three σ; overlaps tell it to a tenth."""
     views = views_of(domes(4e-3, 4e-3), across=3)

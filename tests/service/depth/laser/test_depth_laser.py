@@ -76,7 +76,7 @@ def test_a_sweep_of_stripes(relit, tmp_path, upright):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("upright", "step"), [(True, 0.004), pytest.param(False, 0.005, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("upright", "step"), [(True, 0.004), (False, 0.005)])
 def test_planes_in_reverse_order_are_refused(relit, tmp_path, upright, step):
     """A sphere before a plane is seen with a relief of 0.2 m; the sweep in its own order is not refused."""
     planes = [plane(step * (number - 6), upright=upright) for number in range(13)]
@@ -202,6 +202,7 @@ def test_a_second_plane_in_every_frame_is_told(relit, tmp_path):
     assert outcome.code == 2 and "show a second stripe beside the first" in outcome.err and "multipath" in outcome.err
 
 
+@pytest.mark.long
 def test_a_second_plane_in_one_frame_takes_that_frame_out(relit, tmp_path):
     planes = [plane(x) for x in np.linspace(-0.08, 0.08, 12)]
     others = [plane(0.03) if number == 4 else None for number in range(12)]
@@ -218,6 +219,7 @@ def test_a_second_plane_in_one_frame_takes_that_frame_out(relit, tmp_path):
     assert [warning for warning in report["warnings"] if "1 of 12 frames, 004.exr" in warning]
 
 
+@pytest.mark.long
 def test_a_faint_reflection_takes_nothing_out(relit, tmp_path):
     planes, others = ([plane(x + step) for x in np.linspace(-0.08, 0.08, 12)] for step in (0.0, 0.05))
     scene = make_scene(sphere=False, camera=CAMERA)
@@ -227,7 +229,8 @@ def test_a_faint_reflection_takes_nothing_out(relit, tmp_path):
     assert np.quantile(np.abs(maps.depth - scene.depth)[maps.mask], 0.99) < 1e-3
 
 
-@pytest.mark.parametrize("levels", [255, pytest.param(100, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("levels", [255, 100])
 def test_steps_of_a_file_are_no_light_of_the_laser(relit, tmp_path, levels):
     """A camera quieter than a step of its files, and planes that pass beside the picture: single readings a step off are no stripes."""
     write_lasers(tmp_path, SCENE, [plane(x) for x in np.linspace(-0.3, 0.3, 13)], width=1.5e-3, noise=0.001, levels=levels, camera=CAMERA)

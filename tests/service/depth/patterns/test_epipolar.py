@@ -79,20 +79,20 @@ def judged(rig, wrong, noise, *, stripes=0.0, seed=3):
 
 
 @first_short("stripes", [0.0, 1.0, 4.0])
-@pytest.mark.parametrize("rig", RIGS)
+@first_short("rig", RIGS)
 def test_right_calibrations_raise_no_doubt(rig, stripes):
     for seed in range(4):
         assert judged(rig, None, 0.06, stripes=stripes, seed=seed)[0] is None
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-@pytest.mark.parametrize("rig", RIGS)
+@first_short("rig", RIGS)
 def test_a_wrong_projector_is_said_and_covered(rig, wrong):
     found, error, sigma = judged(rig, wrong, 0.05)
     assert found is not None and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@first_short("rig", RIGS)
 def test_a_principal_point_aside_is_covered(rig):
     """It looks like a turn, which moves all depths otherwise: the fit must not take one for the other."""
     points, pose, uv = scene(rig, 5)
@@ -107,7 +107,7 @@ def test_a_principal_point_aside_is_covered(rig):
     assert told is not None or np.median(error) < 0.01
 
 
-@pytest.mark.parametrize(("which", "aside"), [("projector", 20.0), ("projector", -20.0), ("camera", 15.0), ("camera", -15.0)])
+@first_short(("which", "aside"), [("projector", 20.0), ("projector", -20.0), ("camera", 15.0), ("camera", -15.0)])
 def test_a_principal_point_a_tenth_of_the_width_aside_is_named(which, aside):
     """Along the baseline, where the lines tell the least: all depths were off by more than five sigma."""
     points, pose, uv = scene("left above", 5)
@@ -185,7 +185,7 @@ def test_what_cannot_be_refined_is_refused(relit, tmp_path):
     relit("depth", tmp_path, "--out", tmp_path / "out", "--refine-projector").refused("one axis alone")
 
 
-@pytest.mark.parametrize("k", [(1.5, 0.0), (-1.0, 3.0)])
+@first_short("k", [(1.5, 0.0), (-1.0, 3.0)])
 def test_a_lens_that_no_turn_explains_is_not_taken_for_one(relit, tmp_path, k):
     """As where boards were in the middle of the image alone: a projector turned by 30°, or of a negative focal length, was named."""
     written(tmp_path, None)

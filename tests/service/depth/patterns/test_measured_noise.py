@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.marks import first_short
 from tests.scenes.captures import write_images, write_manifest
 from tests.scenes.depth import BLACK_WHITE, depth_of, entries_of, gray_patterns, make_scene, phase_patterns, shown, write_patterns
 
@@ -27,7 +28,7 @@ def measured(folder, patterns, noise, **options):
     return off, report["found"].get("noise_factor"), [warning for warning in result.warnings if "times as noisy" in warning]
 
 
-@pytest.mark.parametrize("name", CODES)
+@first_short("name", CODES)
 def test_noise_beyond_what_is_declared_is_named_and_held_by_sigma(tmp_path, name):
     """The noise of the default at the mean level is .0055, and that of grey images the same in all channels."""
     off, factor, said = measured(tmp_path, CODES[name], NOISE)
@@ -35,7 +36,7 @@ def test_noise_beyond_what_is_declared_is_named_and_held_by_sigma(tmp_path, name
     assert 0.5 < np.median(off) < 1.0 and (off > 5).mean() < 0.01  # .67 where σ is right
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.004, NOISE])
+@first_short("noise", [0.0, 0.004, NOISE])
 def test_right_noise_is_not_named(tmp_path, noise):
     assert measured(tmp_path, WAVES, noise, read_noise=max(noise, 0.003))[1:] == (None, [])
 

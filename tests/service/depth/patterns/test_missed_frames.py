@@ -67,7 +67,7 @@ def test_copies_of_earlier_frames_are_named(tmp_path, scene, patterns, copies):
     assert f"{number:02d}.exr and {copies[number]:02d}.exr are the same" in said[0] and not solved.any()
 
 
-@pytest.mark.parametrize("patterns", [INVERSES, PLAIN, BINARY, XOR, WAVES, KARY, NUMBERED],
+@first_short("patterns", [INVERSES, PLAIN, BINARY, XOR, WAVES, KARY, NUMBERED],
                          ids=["inverses", "without inverses", "binary", "XOR", "waves", "digits", "numbered"])
 def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
     said, solved = measured(tmp_path, scene, patterns, columns=slice(30, 50), noise=0)
@@ -75,7 +75,7 @@ def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
 
 
 @first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
-@pytest.mark.parametrize("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
+@first_short("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
                          ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
                               "one wave"])
 def test_bits_that_narrow_things_do_not_show_are_not_missed(tmp_path, scene, patterns, columns):

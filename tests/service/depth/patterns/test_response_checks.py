@@ -7,6 +7,7 @@ import pytest
 from benchmarks import projected_scenes
 from benchmarks.projected_scenes import Ball, Wall, World
 from stage.patterns.ramp import ramp_patterns
+from tests.marks import first_short
 from tests.scenes.depth import AMBIENT, PROJECTOR, depth_of, depth_under, grey_light, make_scene, phase_patterns
 
 
@@ -22,8 +23,8 @@ def under_waves(folder, scene, gamma, ambient):
     return depth_under(folder, patterns, light, seed=6, least_confidence=0)
 
 
-@pytest.mark.parametrize("gamma", [1.6, 2.2])
-@pytest.mark.parametrize("ambient", [0.04, 0.2])
+@first_short("gamma", [1.6, 2.2])
+@first_short("ambient", [0.04, 0.2])
 def test_a_bent_wave_is_in_sigma(tmp_path, scene, gamma, ambient):
     result = under_waves(tmp_path, scene, gamma, ambient)
     kept = result.maps.mask & ~scene.shaded
@@ -57,7 +58,7 @@ def under_ramps(folder, monkeypatch, change=lambda frames: frames, *, gamma=1.0,
     return (np.abs(maps.depth - truth) / np.maximum(maps.sigma, 1e-9))[maps.mask], "; ".join(found.warnings)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@first_short("fault", FAULTS)
 def test_ramps_that_are_not_white_and_black_together_are_named(tmp_path, monkeypatch, fault):
     change, words = FAULTS[fault]
     off, said = under_ramps(tmp_path, monkeypatch, change)
@@ -71,7 +72,7 @@ def test_an_undeclared_response_is_named_and_a_declared_one_is_not(tmp_path, mon
     assert "ramps" not in said and (off > 5).mean() < 0.02 and off.size > 10000
 
 
-@pytest.mark.parametrize("gains", [(1, 1, 1, 1), (1.03, 0.97, 1.02, 1)], ids=["steady", "flicker of 3 %"])
+@first_short("gains", [(1, 1, 1, 1), (1.03, 0.97, 1.02, 1)], ids=["steady", "flicker of 3 %"])
 def test_right_ramps_are_not_accused(tmp_path, monkeypatch, gains):
     off, said = under_ramps(tmp_path, monkeypatch, lambda frames: np.minimum(frames * np.array(gains)[:, None, None], 1))
     assert "ramps" not in said and (off > 5).mean() < 0.01 and off.size > 10000

@@ -8,6 +8,7 @@ import pytest
 from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns
+from tests.marks import first_short
 from tests.scenes.depth import depth_of
 
 RIG = Rig(camera=(200, 150), camera_focal=230.0, projector=(256, 192), projector_focal=300.0)
@@ -16,8 +17,7 @@ WORLD = World(shapes=(Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ba
 PATTERNS = {"Gray with inverses": binary_patterns(256, "column"), "Gray": binary_patterns(256, "column", inverses=False),
             "binary": binary_patterns(256, "column", code="binary"), "3-ary": kary_patterns(256, "column", base=3),
             "Gray rows": binary_patterns(192, "row", inverses=False)}
-every_code = pytest.mark.parametrize("name", ["Gray", "Gray rows", *(pytest.param(name, marks=pytest.mark.long) for name in (
-    "Gray with inverses", "binary", "3-ary"))])
+every_code = first_short("name", ["Gray", "Gray rows", "Gray with inverses", "binary", "3-ary"])
 
 
 @pytest.fixture(scope="module")

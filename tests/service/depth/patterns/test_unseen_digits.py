@@ -24,7 +24,8 @@ def solved(folder, world, light, patterns, declared=None):
     return found, (np.abs(found.maps.depth - light.depth) / np.maximum(found.maps.sigma, 1e-9))[known]
 
 
-@first_short(("base", "reflected", "blur_px", "digits"), [
+@pytest.mark.long
+@pytest.mark.parametrize(("base", "reflected", "blur_px", "digits"), [
     (8, False, 3.0, 1), (4, True, 3.0, 1), (3, False, 3.0, 2), (3, True, 0.4, 0), (4, False, 0.4, 0), (8, True, 0.4, 0)])
 def test_colours_that_are_not_resolved_are_left_out(tmp_path, light, base, reflected, blur_px, digits):
     found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light,
@@ -34,6 +35,7 @@ def test_colours_that_are_not_resolved_are_left_out(tmp_path, light, base, refle
         True] * (digits > 0)
 
 
+@pytest.mark.long
 def test_colours_between_dark_and_bright_tell_nothing(tmp_path, light):
     """A palette without a colour whose channels are all dark or bright: no digit is left out."""
     colors = [(1.0, 0.5, 0.0), (0.0, 1.0, 0.5), (0.5, 0.0, 1.0)]

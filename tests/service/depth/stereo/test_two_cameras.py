@@ -11,6 +11,7 @@ from service.depth.stereo.row_offsets import row_offsets
 from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast
 from stage.formats.images import write_png
 from stage.results.depth_maps import DepthMaps
+from tests.marks import first_short
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.depth import (
@@ -63,7 +64,7 @@ def measured(relit, folder, *options):
     return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize(("noise", "most"), [(0.0, 1e-3), (0.004, 4e-3)])
+@first_short(("noise", "most"), [(0.0, 1e-3), (0.004, 4e-3)])
 def test_depth_is_that_of_the_cameras(relit, tmp_path, noise, most):
     """The projector of the manifests has a size and nothing else. Of 1.4 m, planes through 5 × 5 pixels of a sphere are off by
     1 mm, at its rim by a centimetre."""
@@ -113,6 +114,7 @@ def test_a_wrong_pose_is_named_and_sigma_holds_it(relit, tmp_path, degrees):
     assert np.median(left) < 0.8 * np.median(error * maps.sigma[maps.mask]) and (left > 5 * refined.sigma[refined.mask]).mean() < 0.01
 
 
+@pytest.mark.long
 def test_a_principal_point_a_tenth_of_the_width_aside_is_named_and_held(relit, tmp_path):
     """It moved all depths by ten and more sigma."""
     first = two_captures(tmp_path, 0.004)
@@ -124,6 +126,7 @@ def test_a_principal_point_a_tenth_of_the_width_aside_is_named_and_held(relit, t
     assert any("its camera.principal_px were" in sentence for sentence in report["warnings"])
 
 
+@pytest.mark.long
 def test_an_inverse_pose_of_a_small_thing_gives_no_depth(relit, tmp_path):
     """Few pixels are lit on it: they were solved without a word."""
     first = two_captures(tmp_path, 0.004)

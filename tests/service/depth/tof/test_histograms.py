@@ -35,7 +35,7 @@ def is_calibrated(part):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), pytest.param(2000, 4.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), (2000, 4.0)])
 def test_pile_up_that_is_not_declared_is_found(pulses, background, tmp_path):
     """Taken for Poisson counts, these ranges are wrong by many sigma at confidence 1."""
     counts = tof.histogram(VIEW, 4000, background=background, pulses=pulses, seed=1)
@@ -180,6 +180,7 @@ def test_a_ceiling_is_found(ceiling):
     assert full_count(np.minimum(COUNTS, ceiling)) == ceiling
 
 
+@pytest.mark.long
 def test_a_bin_that_the_timer_fills_in_every_pixel_is_no_surface(tmp_path):
     counts = tof.histogram(VIEW, 3000, background=0.5, seed=5)
     counts[..., 40] += np.random.default_rng(2).poisson(80, counts.shape[:2])

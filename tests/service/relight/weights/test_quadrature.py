@@ -52,7 +52,8 @@ def test_no_other_weights_that_are_not_negative_expect_less_error(seed):
     np.testing.assert_allclose(given, best_weights(towards, energy[:, 0], directions), atol=ROUNDING)
 
 
-@first_short("directions", [scattered(300, 3), cap(128, 180), DOME])
+@pytest.mark.long
+@pytest.mark.parametrize("directions", [scattered(300, 3), cap(128, 180), DOME])
 def test_many_lights_meet_the_conditions_of_the_best_weights(directions):
     """Karush, Kuhn and Tucker: the derivative of the expected error is the same at all lights in use, and no less at the others."""
     towards = directions[::17] + 0.05 * scattered(len(directions[::17]), 9)
@@ -129,7 +130,7 @@ def test_layers_end_where_there_is_light_on_both_sides():
 
 
 @pytest.mark.parametrize("directions", [cap(128, 180), scattered(128, 4), DOME], ids=["even", "scattered", "dome"])
-@pytest.mark.parametrize("environment", [lobes(np.random.default_rng(7), 100, 200), np.ones((90, 180, 3)) + sun(90, 180, 30, 50, 5e3)])
+@first_short("environment", [lobes(np.random.default_rng(7), 100, 200), np.ones((90, 180, 3)) + sun(90, 180, 30, 50, 5e3)])
 def test_a_map_is_cut_finely_enough(directions, environment):
     """Truth: every texel by itself, in the same layers."""
     rotation = turn(3)
@@ -141,6 +142,7 @@ def test_a_map_is_cut_finely_enough(directions, environment):
     np.testing.assert_allclose(given, truth, atol=SAMPLED * truth.sum(axis=0).max())
 
 
+@pytest.mark.long
 def test_texels_of_a_coarse_map_are_areas():
     environment = np.random.default_rng(2).random((6, 12, 3))
     directions = scattered(50, 5)

@@ -10,6 +10,7 @@ from service.relight.weights.triangulation import triangulate_sphere
 from service.relight.weights.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 from tests.reference import relight as reference
 from tests.reference.relight import rotation_about, texel_directions, texel_solid_angles
 
@@ -53,7 +54,7 @@ def test_a_constant_map_is_shared_out_whole(rows, cols, direction, device):
     assert got.solid_angle.min() > 0
 
 
-@pytest.mark.parametrize("direction", [AXES, CUBE, icosahedron()], ids=["octahedron", "cube", "icosahedron"])
+@first_short("direction", [AXES, CUBE, icosahedron()], ids=["octahedron", "cube", "icosahedron"])
 def test_symmetric_lights_get_equal_parts(direction, device):
     """The cube too, whose squares could be cut along either diagonal."""
     got = integrate_smooth(np.ones((*HALF_DEGREE, 3)), direction, np.stack([np.eye(3), turn(3)]), device=device)
@@ -83,7 +84,7 @@ def test_a_cube_shares_its_squares_by_four_triangles(seed, device):
     np.testing.assert_allclose(shares_along(CUBE, rotation, np.zeros(1), device=device)[0][0], expected, atol=SHARE)
 
 
-@pytest.mark.parametrize("at", [(40, 100), (180, 200), (250, 100), (300, 500), (359, 0)])
+@first_short("at", [(40, 100), (180, 200), (250, 100), (300, 500), (359, 0)])
 def test_what_comes_from_below_a_dome_goes_to_its_rim(at, device):
     """As if there were a light at -y, whose share goes to the four on the horizon."""
     x, y, z = texel_directions(*HALF_DEGREE)[at]

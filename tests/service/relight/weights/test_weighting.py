@@ -14,6 +14,7 @@ from service.requests.relight import LightWeights
 from stage.transforms import rotation_about, rotation_about_y
 from tests.kernels.relight.lights import AXES, STILL, turn
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 from tests.reference.relight import texel_solid_angles
 
 
@@ -100,7 +101,7 @@ def test_turns_by_whole_columns_are_found_once(rotations, searches):
             assert np.allclose(rotation_about_y(columns * 0.5) @ found.rotation, rotations[frame], atol=1e-8)
 
 
-@pytest.mark.parametrize("weighting", list(LightWeights))
+@first_short("weighting", list(LightWeights))
 def test_shared_turns_give_the_sums_of_single_ones(weighting, device):
     rotations, lights = spin(48), cap(40, 180)
     whole = integrate(SKY, lights, rotations, weighting=weighting, device=device)

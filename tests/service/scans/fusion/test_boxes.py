@@ -15,6 +15,7 @@ from service.scans.fusion.fused_surface import places_near
 from service.scans.fusion.range_images import PreparedScan, focal_of, prepare_scan
 from service.scans.points.ply_points import read_ply_points
 from stage.capture.camera import Camera, Distortion
+from tests.marks import first_short
 from tests.scenes.register import fuse_scans, scan_with
 from tests.scenes.statue import shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
@@ -87,7 +88,7 @@ def outline(camera, pose):
     return PreparedScan("scan", image, camera, (), nothing, nothing, False)
 
 
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@first_short("camera", CAMERAS.values(), ids=CAMERAS)
 def test_a_window_holds_all_that_its_camera_sees_of_a_box_and_little_else(camera):
     rng = np.random.default_rng(3)
     seen_pixels = window_pixels = 0

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from service.errors import RequestError
 from service.requests.register import Misplaced
 from service.scans.fusion.misplaced import Readings, Sample, place_scans
+from tests.marks import first_short
 from tests.scenes.register import fuse_scans
 from tests.scenes.statue import place, shoot, turntable, write_scans
 
@@ -134,7 +135,7 @@ def test_inverted_poses_are_named_so(tmp_path, moved_m):
     assert sum("the poses are world_to_scan" in warning for warning in kept.warnings) == 1
 
 
-@pytest.mark.parametrize(("written", "words"), [
+@first_short(("written", "words"), [
     (np.linalg.inv, "that were imported are world_to_camera"),
     (lambda pose: with_quaternion(pose, np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)), "begin with w"),
     (lambda pose: pose @ np.diag([1.0, -1, -1, 1]), "the y and z axes of the scans are negated")])

@@ -13,6 +13,7 @@ from service.scans.registration.pairs import PairState, prepare
 from service.scans.registration.registration import NoneJoinedError, Registration
 from stage.capture.camera import Camera
 from stage.errors import ScanError
+from tests.marks import first_short
 from tests.scenes import statue
 from tests.scenes.register import off, register, scan_of, seen
 from tests.scenes.turntable import MM, View, ball, box, capsule, figure, pillar, urn, vase
@@ -100,7 +101,7 @@ def test_what_looks_the_same_after_a_motion_is_refused(name, known):
         registered(views, starts)
 
 
-@pytest.mark.parametrize(("rows", "sigma"), [(60, 0.25 * MM), (80, 0.25 * MM), (120, 0.02 * MM)], ids=["21 mm", "16 mm", "little noise"])
+@first_short(("rows", "sigma"), [(60, 0.25 * MM), (80, 0.25 * MM), (120, 0.02 * MM)], ids=["21 mm", "16 mm", "little noise"])
 def test_a_vase_is_refused_at_any_spacing_and_noise(rows, sigma):
     """Points far apart for the bend have normals that are wrong by more than their noise; they must not pass for a shape."""
     with pytest.raises(ScanError, match="surface looks the same when it is turned"):
@@ -134,7 +135,7 @@ def statues(count: int, rows: int, numbers: range | tuple[int, ...]) -> list[Vie
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pair", [(3, 6), pytest.param((0, 8), marks=pytest.mark.long)], ids=["quarter turn", "half turn"])
+@pytest.mark.parametrize("pair", [(3, 6), (0, 8)], ids=["quarter turn", "half turn"])
 def test_a_body_is_told_from_its_turned_self_by_what_sticks_out(pair):
     """The turned pose matches more of the surface; it would put arm, blade and plates where the other camera saw through."""
     views = statues(18, 240, pair)

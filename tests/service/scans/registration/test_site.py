@@ -55,6 +55,7 @@ def test_poses_of_squares_of_pixels_are_as_sure_as_they_say(monkeypatch):
     assert step @ pair.fit.information @ step < 30
 
 
+@pytest.mark.long
 def test_a_courtyard_of_coarse_points_is_placed(scans):
     found = register(scans, [scan.pose for scan in scans])
     first, second = (found.poses[number] @ inverse(scan.pose) for number, scan in enumerate(scans))

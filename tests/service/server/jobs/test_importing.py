@@ -74,7 +74,7 @@ def run_killed(harness, identifier, monkeypatch, last):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
 @pytest.mark.parametrize("last", ["before", "after"])
 def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):
     identifier, names = uploaded
@@ -98,6 +98,7 @@ def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_ha
     assert stored(idle_harness, identifier) == (names,) * 2
 
 
+@pytest.mark.long
 @ON_SQLITE
 def test_an_import_that_was_killed_after_its_capture_was_ready_changes_nothing_when_it_is_run_again(idle_harness, uploaded):
     """The capture's own pixels use the quota up, which would refuse it if they were asked for twice."""

@@ -58,6 +58,7 @@ def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  #
     return submitted
 
 
+@pytest.mark.long
 def test_a_thousand_captures_are_searched_sorted_and_filtered(page):
     found = [capture(number) for number in range(CAPTURES)]
     found[7] = capture(7, steps=3) | {"name": EVIL}

@@ -72,6 +72,7 @@ def test_a_surface_of_which_nothing_is_solved_throws_no_shadow(tmp_path):
     assert report["pixels"]["ok"] == 0 and "of the shadows" not in " ".join(report["warnings"])
 
 
+@pytest.mark.long
 def test_a_part_whose_shadow_meets_no_other_has_an_unknown_step(tmp_path):
     """A second ball beside the body, so far off that no shadow joins them."""
     parts = [Part((1.7, 0.0, 0.4), (0.4, 0.4, 0.4)), Part((0.0, 0.0, 0.0), (0.7, 0.7, 0.5))]

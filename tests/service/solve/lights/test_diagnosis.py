@@ -109,6 +109,7 @@ def test_wrong_brightness_encoding_and_order_are_named_and_doubted(tmp_path, sce
     assert confidence(result) < UNSURE
 
 
+@pytest.mark.long
 def test_wrong_brightness_that_the_solve_replaces_is_named_and_not_doubted(tmp_path):
     result = solved(tmp_path, SCENE._replace(irradiance=np.ones_like(SCENE.irradiance)), Method.LAMBERT)
     assert "every light is declared alike" in alarms(result)[0] and "the solve has used the brightness" in alarms(result)[0]

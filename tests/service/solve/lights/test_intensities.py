@@ -138,7 +138,8 @@ def highlight(normal, directions):
     return np.maximum(normal @ (half / np.linalg.norm(half, axis=1, keepdims=True)).T, 0).transpose(2, 0, 1) ** 12
 
 
-@pytest.mark.parametrize("wrong", [pytest.param(0, marks=pytest.mark.long), 0.3])
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", [0, 0.3])
 def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_path, wrong):
     """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were
     8° off, and sure. Where lights are wrong beside it, that is said, and σ holds it."""
@@ -156,6 +157,7 @@ def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_
     assert np.percentile(over_sigma, 99) < 5 and (wrong or np.percentile(error, 10) < 0.2), np.percentile(error, 10)  # 20 % is the ball
 
 
+@pytest.mark.long
 def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path):
     """Most of the picture is one plane, which shades alike under any lights; what is left are 0.2 % of noise and the ball's rim."""
     directions, (y, x) = cap(12, 47.0), np.mgrid[1:-1:48j, -1:1:48j]
@@ -166,7 +168,7 @@ def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path
     assert report["found"]["light_intensities"]["used"] == "estimated" and np.median(error) < 0.5, np.median(error)
 
 
-@pytest.mark.parametrize(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
+@first_short(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
 @first_short("degrees", [3, 1, 5])
 def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_them(tmp_path, degrees, gloss, wrong):
     """As of a varnished picture: its normals were 22 to 29° off, by up to 61 σ, under right lights."""

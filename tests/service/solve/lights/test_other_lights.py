@@ -51,7 +51,7 @@ def solve(relit, folder, scene):
     return angles_degrees(maps.normal, scene.normal), maps.sigma, outcome.out
 
 
-@pytest.mark.parametrize(("lights", "away", "gloss"), [(9, 2.2, 0.0), (6, 3.5, 0.0), (14, 2.6, 0.15)])
+@first_short(("lights", "away", "gloss"), [(9, 2.2, 0.0), (6, 3.5, 0.0), (14, 2.6, 0.15)])
 def test_near_lights_that_are_declared_distant(relit, tmp_path, lights, away, gloss):
     error, sigma, said = solve(relit, tmp_path, hills(lights, away=away, gloss=gloss))
     assert "the lights look near" in said

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
+from tests.marks import first_short
 from tests.reference.microfacet import specular
 from tests.scenes.captures import angles_degrees, write_capture
 from tests.scenes.ellipsoid import ellipsoid, seen_from_near
@@ -44,15 +45,15 @@ def solved(folder, name, turn, lights="declared"):
     return error, result.maps.sigma[known].astype(float), json.loads((folder / "out" / "report.json").read_text())
 
 
-@pytest.mark.parametrize("name", [*QUICK, pytest.param("glossy", marks=pytest.mark.long)])
+@first_short("name", [*QUICK, "glossy"])
 def test_lights_that_are_declared_right_raise_no_doubt(tmp_path, name):
     _, _, report = solved(tmp_path, name, (0, 0, 0))
     assert "light_turn" not in report["found"] and not any("frames[]" in sentence for sentence in report["warnings"])
 
 
-@pytest.mark.parametrize(("name", "how"), [
+@first_short(("name", "how"), [
     *((name, "tilted") for name in QUICK), ("perspective", "about the view axis"),
-    pytest.param("glossy", "tilted", marks=pytest.mark.long)])
+    ("glossy", "tilted")])
 def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how):
     """Without it normals were wrong by the turn, beyond ten σ of matt ones, without a word."""
     error, sigma, report = solved(tmp_path, name, TURNS[how])
@@ -62,7 +63,8 @@ def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how
     assert np.median(error) > 2 and np.median(error / sigma) < 1.4 and (error > 5 * sigma).mean() < 0.01
 
 
-@pytest.mark.parametrize("turn", [(30, 0, 0), pytest.param((0, -45, 0), marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("turn", [(30, 0, 0), (0, -45, 0)])
 def test_matt_surfaces_tell_larger_turns(tmp_path, turn):
     """They were taken for what metals make up: normals were wrong by 27° at a σ of 2°, without a word."""
     error, sigma, report = solved(tmp_path, "matt", turn)
