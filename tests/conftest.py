@@ -48,6 +48,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("device", names, indirect=True)
 
 
+GARBAGE = 100_000
+"""Objects after which garbage is searched for: after Python's own 700 it takes half of the time of tests that parse all modules."""
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Spare what is loaded for tests the search for garbage: it stays, and looking through it would take a third of the time."""
@@ -57,6 +61,7 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.enable()
         gc.freeze()
+        gc.set_threshold(GARBAGE)
         atexit.register(gc.unfreeze)  # some libraries look for leaks as the interpreter ends; pytest's last search comes before
 
 

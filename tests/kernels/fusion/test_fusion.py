@@ -64,6 +64,7 @@ def test_a_sphere_is_closed_and_as_sure_as_it_says(device, sphere_shots):
     assert 0.5 < np.sqrt(np.mean(normalised**2)) < 1.1  # LATERAL allows for an error of 0.25 mm that this camera does not have
 
 
+@pytest.mark.long
 def test_without_noise_only_the_chords_between_pixels_are_left(device):
     images = [range_image(shot, SIGMA) for shot in around(sphere, sigma=0.0)]
     points, _, _ = fuse(images, 2.5e-3, *BOX, device=device)

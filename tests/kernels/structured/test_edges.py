@@ -55,7 +55,7 @@ def test_edges_are_finer_than_stripes(per_pixel, stripe, down, device):
     assert 0.75 < z.std() < 1.2  # what interpolation misses is the same at both edges or not, as their places among the pixels have it
 
 
-@pytest.mark.parametrize("seen", [0.0, 0.3, 0.6, 0.9, 1.3, 2.0])
+@first_short("seen", [0.0, 0.3, 0.6, 0.9, 1.3, 2.0])
 @first_short("per_pixel", [0.31, 0.83])
 def test_sigma_holds_edges_that_pass_between_pixels_unseen(per_pixel, seen, device):
     """Pixels see a part of the distance between them, in the limit points, as in images that are shrunk without a filter: to WHOLE of it

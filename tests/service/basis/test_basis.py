@@ -146,7 +146,8 @@ def test_a_viewer_shows_what_was_said(relit, tmp_path, kind, name, count, most):
     assert re.search(r"of what is shown, \d+\.\d of 255: ", outcome.out)
 
 
-@pytest.mark.parametrize(("name", "kind"), [("b.exr", "svd"), ("b.ptm", "ptm"), ("b.rti", "hsh"), ("b.PTM", "ptm")])
+@pytest.mark.parametrize(("name", "kind"), [("b.exr", "svd"), ("b.ptm", "ptm"), ("b.rti", "hsh"),
+                                             pytest.param("b.PTM", "ptm", marks=pytest.mark.long)])
 def test_the_suffix_says_the_kind_and_two_runs_are_one_file(relit, tmp_path, name, kind):
     write_dome(tmp_path / "cap", dome(20))
     before = files_in(tmp_path / "cap")

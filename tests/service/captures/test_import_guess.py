@@ -11,6 +11,7 @@ from service.captures.importing import import_chosen, propose
 from service.requests.base.import_choices import ImportChoices
 from stage.capture.capture import Capture
 from stage.errors import ManifestError
+from tests.marks import first_short
 from tests.scenes import near_lights
 from tests.scenes.captures import files_in, make_scene, write_image
 from tests.service.captures.test_import_laser import as_text, write_camera, write_scan
@@ -174,7 +175,7 @@ def blurred_stripes(sequence, *, inverses, fine_first, gray=1, bits=(8, 7)):
     return images
 
 
-@pytest.mark.parametrize(("sequence", "inverses", "fine_first"), [
+@first_short(("sequence", "inverses", "fine_first"), [
     ("white,black,columns", "none", False), ("rows,columns,black,white", "pairs", True), ("columns,rows", "blocks", False),
     ("columns", "pairs", False), ("columns,rows,white,black", "first", False), ("rows,black,white", "first", True)])
 def test_codes_are_told_from_the_images_alone(relit, tmp_path, sequence, inverses, fine_first):
@@ -188,7 +189,7 @@ def test_codes_are_told_from_the_images_alone(relit, tmp_path, sequence, inverse
 
 
 @pytest.mark.parametrize("inverses", ["pairs", "first"])
-@pytest.mark.parametrize("even", ["white,black", "black,white"])
+@first_short("even", ["white,black", "black,white"])
 def test_codes_on_a_small_object_are_told(relit, tmp_path, even, inverses):
     """The coarse stripes cover an object on an eighth of the image, before darkness, as a whole: all is told by the other stripes."""
     near = np.hypot(*(np.mgrid[:100, :128] - np.array([50, 40])[:, None, None])) < 22

@@ -78,7 +78,7 @@ COLUMN_M = 0.065
 """Metres of depth that a projector column is worth here, at most."""
 
 
-@pytest.mark.parametrize("layout", ["references first, no inverses", "inverses first", "inverses in blocks, fine first", "fewer bits",
+@first_short("layout", ["references first, no inverses", "inverses first", "inverses in blocks, fine first", "fewer bits",
                                     "OpenCV's, as a scanner"])
 def test_gray_codes(relit, tmp_path, layout):
     calibration = write_calibration(tmp_path / "rig.yml", OPENCV)

@@ -22,6 +22,7 @@ from service.server.base.settings import Settings
 from service.server.process import devices as process_devices
 from service.solve import opening
 from stage.capture.capture import Capture
+from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
 SHOWN = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
@@ -190,7 +191,7 @@ def test_a_command_is_in_the_module_that_is_loaded_for_it(name):
     assert name in get_command(program(name)).commands
 
 
-@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({"OMP_NUM_THREADS": "2"}, None)])
+@first_short(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({"OMP_NUM_THREADS": "2"}, None)])
 def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(relit, monkeypatch, given, expected):
     for name in BLAS_THREADS:
         monkeypatch.delenv(name, raising=False)

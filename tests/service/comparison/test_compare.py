@@ -93,9 +93,10 @@ def test_verdicts_over_random_scans(tmp_path, part, depth):
 def test_σ_covers_the_deviations(tmp_path, part):
     made, design = part
     scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(5), 20_000))
-    points = read_ply_points(compare(request(tmp_path, scan, design, align="none")).deviations_path)
+    found = compare(request(tmp_path, scan, design, align="none"))
+    points = read_ply_points(found.deviations_path)
     assert np.nanmedian(points.sigma) == pytest.approx(SIGMA_M, rel=1e-3)  # float32
-    assert compare(request(tmp_path, scan, design, align="none")).rms_m == pytest.approx(SIGMA_M, rel=0.03)  # √(1 / 2n) is .005; edges
+    assert found.rms_m == pytest.approx(SIGMA_M, rel=0.03)  # √(1 / 2n) is .005; edges
     estimated = compare(request(tmp_path, write_scan(tmp_path / "bare.ply", scan_of(made, np.random.default_rng(5), 20_000), None), design,
                                 align="none"))
     assert reported(estimated)["sigma_source"] == "estimated" and "shared-sigma" in " ".join(estimated.warnings)

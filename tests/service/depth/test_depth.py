@@ -125,7 +125,7 @@ def test_every_code(relit, tmp_path, patterns, name, worst_px):
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
 
 
-@pytest.mark.parametrize(("patterns", "name", "worst_px"), [
+@first_short(("patterns", "name", "worst_px"), [
     ([*phase_patterns("column", 16), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
     ([*phase_patterns("column", 16, 3), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
     ([*phase_patterns("row", 96), *gray_patterns("column", inverse=False)], "gray, white and black from phases", 1.0),

@@ -41,10 +41,8 @@ def join(view: View, *, noise: float, drift: float, sigma: float, device: str, s
 
 
 @first_short("perspective", [False, True])
-@pytest.mark.parametrize(("noise", "drift", "sigma"), [
-    (2, 3, 0.1 * MM), (0.5, 2, 0.5 * MM),
-    *(pytest.param(*more, marks=pytest.mark.long) for more in ((0.5, 0, 0.5 * MM), (0.2, 4, 2 * MM)))])
-@pytest.mark.parametrize("shape", ["wave", pytest.param("disc", marks=pytest.mark.long)])
+@first_short(("noise", "drift", "sigma"), [(2, 3, 0.1 * MM), (0.5, 2, 0.5 * MM), (0.5, 0, 0.5 * MM), (0.2, 4, 2 * MM)])
+@first_short("shape", ["wave", "disc"])
 def test_better_than_the_depth_and_no_worse_than_the_normals(device, shape, noise, drift, sigma, perspective):
     view = see(shape, perspective=perspective)
     joined, given = join(view, noise=noise, drift=drift, sigma=sigma, device=device)
@@ -294,6 +292,7 @@ def test_the_joined_surface_is_better_than_both(relit, tmp_path, perspective):
     assert report["relief_unexplained"] < 0.1
 
 
+@pytest.mark.long
 def test_what_the_calibration_leaves_open_is_said_again(relit, tmp_path):
     """A depth whose scale is known to 2 % was joined to hundredths of a millimetre without a word."""
     solved, depth, z, _ = write(tmp_path)

@@ -73,7 +73,7 @@ def test_an_exposure_that_changes_is_named_with_its_image(first, factor, gloss):
     assert f"from {first:03d}.exr on, all images look {found.step.factor:.2g} times as bright" in explanation_sentence(found, sample)
 
 
-@pytest.mark.parametrize("change", [np.ones(24), np.exp(0.2 * np.random.default_rng(4).normal(size=24)), np.linspace(0.7, 1.3, 24),
+@first_short("change", [np.ones(24), np.exp(0.2 * np.random.default_rng(4).normal(size=24)), np.linspace(0.7, 1.3, 24),
                                     np.where(np.arange(24) == 20, 0.4, 1.0)])
 def test_lights_that_differ_are_no_step(change):
     """Equal lights, single ones, lamps that fade, and one that is dim."""
@@ -165,8 +165,9 @@ def coin(roughness, dielectric, count=40):
     return readings * (1 + 0.005 * draw.normal(size=readings.shape)), lights
 
 
-@pytest.mark.parametrize("roughness", [0.3, pytest.param(0.5, marks=pytest.mark.long)])
-@first_short("dielectric", [True, False])
+@pytest.mark.long
+@pytest.mark.parametrize("roughness", [0.3, 0.5])
+@pytest.mark.parametrize("dielectric", [True, False])
 def test_a_coin_whose_highlight_is_smooth_over_the_lights_is_accused_of_nothing(roughness, dielectric):
     readings, lights = coin(roughness, dielectric)
     sample = sample_of(readings, lights)

@@ -94,6 +94,7 @@ def test_integers_at_full_scale_are_clipped_without_a_word_in_the_manifest(relit
     assert "is from readings that are clipped" in out
 
 
+@pytest.mark.long
 def test_basis_of_brackets_holds_whole_readings(relit, capture):
     """Each of three frames of a light gives the same, merged image: the coefficients are those of the images without clipping."""
     clip(capture / "cap", 0.15, exposures=(4.0, 1.0, 0.25))

@@ -218,7 +218,7 @@ def test_maps_without_height_have_no_depth(relit, lit, tmp_path):
     assert outcome.code == 2 and outcome.err == f"relit: {tmp_path / 'maps' / 'maps.exr'}: has no layer height, which --aov depth needs\n"
 
 
-@pytest.mark.parametrize(("rate", "number", "fraction", "code"), [
+@first_short(("rate", "number", "fraction", "code"), [
     (None, 1001, Fraction(24), (0, 0, 41, 17)), ("25", 90000, Fraction(25), (1, 0, 0, 0)), ("59.94", 7, Fraction(60000, 1001), None),
     ("29.97", 31, Fraction(30000, 1001), (0, 0, 1, 1)), ("12.5", 106, Fraction(25, 2), None),
     ("keys", 24, Fraction(24000, 1001), (0, 0, 1, 0))])

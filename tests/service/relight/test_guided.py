@@ -126,6 +126,7 @@ def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, t
         assert all(np.array_equal(rgb(out / name), pixels) for name, pixels in whole.items())
 
 
+@pytest.mark.long
 def test_maps_of_a_version_that_hashed_otherwise_guide_with_a_warning(relit, scene, tmp_path):
     folder, _ = scene
     words = ("relight", folder / "cap", "--environment", folder / "sky.exr")

@@ -83,6 +83,7 @@ def test_the_specular_layer_is_that_of_a_frame_alone(relit, scene, tmp_path):
     assert SURFACE.off(together, alone) < 0.002 and alone[SURFACE.mask].min() > 0
 
 
+@pytest.mark.long
 def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
     """To the rounding of its sine and cosine, and half."""
     options = keys(tmp_path, environment=[{"frame": 1, "turn_degrees": 0}, {"frame": FRAMES, "turn_degrees": 360}])

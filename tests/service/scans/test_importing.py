@@ -25,6 +25,12 @@ def views() -> list[View]:
     return turntable(figure, ANGLES, rows=120)
 
 
+@pytest.fixture(scope="module")
+def two() -> list[View]:
+    """The first of them."""
+    return turntable(figure, ANGLES[:2], rows=120)
+
+
 def points_of(view: View) -> np.ndarray:
     """[n, 3] of a scan in a frame of the device, whose origin lies within the figure."""
     return view.camera.points(-view.depth)[view.mask].astype(float) + SHIFT
@@ -102,8 +108,8 @@ def test_a_body_seen_from_all_around_is_no_scan():
     assert found.place is None and "one place" in found.reason
 
 
-def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, views):
-    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, two):
+    folder = write(tmp_path / "scans", [points_of(view) for view in two])
     turn = Rotation.from_euler("y", 24, degrees=True)
     lines = ["camera 0 0 0 0 0 0 1", "bmesh scan_0.ply 0 0 0 0 0 0 1",
              f"bmesh scan_24.ply 0.1 0.2 0.3 {' '.join(map(str, turn.inv().as_quat()))}"]
@@ -127,8 +133,8 @@ def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, views):
 
 
 @pytest.mark.long
-def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, tmp_path, views):
-    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, tmp_path, two):
+    folder = write(tmp_path / "scans", [points_of(view) for view in two])
     write_set(folder, [{"name": f"s{number}", "path": f"scan_{24 * number}.ply"} for number in range(2)])
     relit("register", folder, "--out", tmp_path / "out")
     said = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"] if (tmp_path / "out" / "report.json").exists() else []
@@ -171,9 +177,9 @@ def test_a_scan_in_inches_among_others_is_asked_about(relit, tmp_path, of_first,
     assert ("are they in one unit?" in said) == asked
 
 
-def test_rotations_off_orthonormal_are_made_rotations_and_said(relit, tmp_path, views):
+def test_rotations_off_orthonormal_are_made_rotations_and_said(relit, tmp_path, two):
     """Scan sets, PTX files and .conf files are treated alike; stretches of a thousandth and more are no poses."""
-    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+    folder = write(tmp_path / "scans", [points_of(view) for view in two])
     turn = Rotation.from_euler("xyz", [5, 24, -8], degrees=True)
     quaternion = (1 + 1.6e-4) * turn.inv().as_quat()
     (folder / "scans.conf").write_text(f"camera 0 0 0 0 0 0 1\nmesh scan_0.ply 0 0 0 0 0 0 1\n"

@@ -11,6 +11,7 @@ from service.scans.read import read_scan
 from stage.errors import ResultError
 from stage.formats.ply import PointCloud, read_ply, write_ply
 from stage.sets.scan_set import read_scan_set
+from tests.marks import first_short
 
 POINTS = np.random.default_rng(0).random((20, 3))
 COLOURS = np.arange(60, dtype=np.uint8).reshape(20, 3) * 4
@@ -86,7 +87,7 @@ def wkt(text):
     return laspy.vlrs.known.WktCoordinateSystemVlr(text)
 
 
-@pytest.mark.parametrize(("record", "units"), [
+@first_short(("record", "units"), [
     (wkt(f'PROJCS["New York (ftUS)",{GEOGRAPHIC},PARAMETER["false_easting",984250],UNIT["US survey foot",0.3048006096012192],'
          'AXIS["X",EAST]]'), [SURVEY_FOOT] * 3),
     (wkt(f'COMPD_CS["a [both]",PROJCS["b",{GEOGRAPHIC},UNIT["foot",0.3048]],VERT_CS["c",VERT_DATUM["d",2005],UNIT["metre",1.0]]]'),

@@ -25,6 +25,7 @@ def test_flipped_normals_do_not_put_the_scanner_behind(shift):
     assert right.place is not None and (right.place[:, 2] > points[:, 2].max() - 0.1).all()
 
 
+@pytest.mark.long
 def test_normals_of_a_bowl_before_its_scanner_are_not_accused():
     """Its rims turn towards the scanner, as those of a body do that is seen from behind, but the scanner is at the origin."""
     points, normals = cap(hollow=True)

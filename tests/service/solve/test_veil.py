@@ -1,6 +1,7 @@
 """Light that lies over images, as glare of a lens, makes dark parts as unsure as it turns their normals."""
 
 import numpy as np
+import pytest
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
@@ -62,7 +63,8 @@ def test_dark_parts_under_glare_are_as_unsure_as_they_are_wrong(tmp_path, spoilt
     assert (ratio > 5).mean() < 0.005
 
 
-@first_short("right", [{}, {"rough": 0.3}, {"bounced": 0.2}], ids=["matt", "rough", "bounced light"])
-@first_short("method", [Method.ROBUST, Method.SVBRDF])
+@pytest.mark.long
+@pytest.mark.parametrize("right", [{}, {"rough": 0.3}, {"bounced": 0.2}], ids=["matt", "rough", "bounced light"])
+@pytest.mark.parametrize("method", [Method.ROBUST, Method.SVBRDF])
 def test_light_that_goes_with_albedo_is_no_glare(tmp_path, right, method):
     assert WORDS not in solved(tmp_path, hills(**right), method)[2]

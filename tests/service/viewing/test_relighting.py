@@ -114,6 +114,7 @@ def test_the_energy_of_every_direction_is_kept(tmp_path):
     np.testing.assert_allclose(np.einsum("rqlc,lc->rqc", found.weights(), captured), 0.25, rtol=2e-3)  # half rounding of the one image
 
 
+@pytest.mark.long
 def test_light_from_beyond_the_captured_lights_is_flagged(tmp_path):
     front = sphere_directions(120)
     front = front[front[:, 2] > 0.5]

@@ -62,6 +62,7 @@ def test_a_frame_is_the_same_to_the_last_bit_whichever_others_are_made(device):
         assert np.array_equal(combining.combine_batch(band, weights[kept]).numpy(), whole[kept])
 
 
+@pytest.mark.long
 def test_a_batch_of_many_chunks(device):
     stack = captured(40, MANY)
     weights = drawn((2, 3, 40))

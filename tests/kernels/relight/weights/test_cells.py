@@ -8,6 +8,7 @@ from kernels.relight.directions.latlong import cut
 from kernels.relight.weights.cells import integrate_cells, nearest_light
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
+from tests.marks import first_short
 from tests.reference import relight as reference
 from tests.reference.relight import rotation_about, rotation_about_y, texel_directions, texel_solid_angles
 
@@ -133,7 +134,7 @@ def test_spin_turns_the_environment_from_z_towards_x(spin, light, device):
     assert np.flatnonzero(cells.energy[0, :, 0]).tolist() == [light]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@first_short("seed", range(4))
 def test_turning_a_map_about_any_axis_is_turning_the_lights_back(seed, device):
     """A map that brightens along an axis, turned in closed form."""
     direction, rotation = cap(40, 180), turn(seed)

@@ -143,6 +143,7 @@ def test_a_tile_far_from_where_the_stage_says_is_found_and_told():
     assert any("tile t1 lies" in sentence and "from where the stage says" in sentence for sentence in stitched.warnings)
 
 
+@pytest.mark.long
 def test_along_a_straight_edge_no_shift_is_measured():
     """The aperture problem: a step across all tiles measures their shift across it, and along it they lie where the stage says."""
     views = views_of(lambda x, y: 5e-5 / (1 + np.exp(-(y - 0.3 * x) / 1.5e-5)), stage=PIXEL)

@@ -11,6 +11,7 @@ from service.depth.patterns.levels import EvenSums, check_levels
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns as waves
+from tests.marks import first_short
 from tests.scenes.captures import write_image, write_manifest
 from tests.scenes.depth import depth_of, depth_under, gray_patterns, grey_light, make_scene, manifest, phase_patterns, sample_of, shown
 
@@ -37,13 +38,13 @@ def measured(folder, scene, patterns, part, *, gamma=1.0):
 
 
 @pytest.mark.parametrize("patterns", [NUMBERED, SEVERAL], ids=["numbered", "several"])
-@pytest.mark.parametrize("part", [0.2, 0.3])
+@first_short("part", [0.2, 0.3])
 def test_frames_that_mix_two_patterns_are_named(tmp_path, scene, patterns, part):
     result = measured(tmp_path, scene, patterns, part)
     assert not result.maps.mask.any() and mixed(result)
 
 
-@pytest.mark.parametrize(("patterns", "gamma"), [(NUMBERED, 1.0), (SEVERAL, 1.0), (NUMBERED, 1.8)],
+@first_short(("patterns", "gamma"), [(NUMBERED, 1.0), (SEVERAL, 1.0), (NUMBERED, 1.8)],
                          ids=["numbered", "several", "a camera that is not linear"])
 def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
     result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)

@@ -42,7 +42,7 @@ def measured(folder, scene, patterns, *, dark=(), again=(), copies=None, columns
     return [warning for warning in result.warnings if "missed" in warning or "copy" in warning], result.maps.mask
 
 
-@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 1), (NUMBERED, 7), (INVERSES, 8), (INVERSES, 3), (PLAIN, 5), (WAVES, 4),
+@first_short(("patterns", "number"), [(NUMBERED, 1), (NUMBERED, 7), (INVERSES, 8), (INVERSES, 3), (PLAIN, 5), (WAVES, 4),
                                                    (KARY, 5)],
                          ids=["wave", "bit", "bit with inverse", "inverse", "bit without inverse", "one of several waves", "digit"])
 def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
@@ -50,7 +50,7 @@ def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
     assert f"{number:02d}.exr shows no stripes" in said[0] and not solved.any()
 
 
-@pytest.mark.parametrize(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (BINARY, 6), (PLAIN, 5), (WAVES, 3),
+@first_short(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (BINARY, 6), (PLAIN, 5), (WAVES, 3),
                                                    (KARY, 5)],
                          ids=["wave", "bit", "inverse", "bit of a binary code", "bit without inverse", "next wave", "digit"])
 def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, patterns, number):

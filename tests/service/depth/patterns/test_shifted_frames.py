@@ -55,7 +55,8 @@ def test_a_camera_that_drifts_is_named_and_sigma_holds_it(tmp_path, light, name)
     assert (off > 5).mean() < 0.005
 
 
-@pytest.mark.parametrize("name", [pytest.param("Gray with inverses", marks=pytest.mark.long), "Gray"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["Gray with inverses", "Gray"])
 def test_a_camera_that_shakes_is_named_and_sigma_holds_it(tmp_path, light, name):
     rng = np.random.default_rng(2)
     said, size, off = measured(tmp_path, light, name, lambda part: rng.normal(0, 0.5))

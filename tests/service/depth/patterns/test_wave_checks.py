@@ -81,8 +81,8 @@ def test_right_waves_raise_no_doubt(patterns, side):
     (ONE, reversed_steps(ONE), "steps run backwards"),
     (ONE, offset(ONE, -np.pi / 2), "check offset_rad"),
     (FOUR, offset(FOUR, np.pi), "check offset_rad"),
-    (THREE, reversed_steps(THREE), "if their steps run backwards"),
-    (THREE, offset(THREE, -np.pi / 2), "offset is changed by π/2"),
+    *(pytest.param(*more, marks=pytest.mark.long) for more in (
+        (THREE, reversed_steps(THREE), "if their steps run backwards"), (THREE, offset(THREE, -np.pi / 2), "offset is changed by π/2"))),
     (THREE, changed(THREE, period_px=lambda p: {22.0: 21.4}.get(p.period_px, p.period_px)), "as waves of 22 px"),
     (TWO, changed(TWO, period_px=lambda p: {50.0: 52.0}.get(p.period_px, p.period_px)), "check period_px"),
 ], ids=["reversed", "sine", "four, half a turn", "three reversed", "three, sine", "period", "period of two"])
@@ -117,7 +117,8 @@ def test_waves_of_the_rows_keep_what_is_said_of_the_columns(periods):
     assert wrong is None and unconfirmed.startswith("frames[].pattern: the column phases run")
 
 
-@first_short("gamma", [1.5, 2.1])
+@pytest.mark.long
+@pytest.mark.parametrize("gamma", [1.5, 2.1])
 def test_bent_waves_are_bent_back_by_the_exponent_that_makes_them_agree(gamma):
     """Grid of 0.05 in the exponent; what is left is that of half a step, 0.004 rad, and noise."""
     wrong, _, found = said(THREE, THREE, gamma=gamma)

@@ -77,6 +77,7 @@ def test_exchanged_periods_are_named(order):
     assert "if their periods are 19, 22, 26 px, in the order" in said(patterns, changed(patterns, period_px=lambda p: to[p.period_px]))[0]
 
 
+@pytest.mark.long
 def test_a_wrong_period_is_not_taken_for_steps_that_run_backwards():
     patterns = list(phase_patterns("column", (42.0, 45.0, 48.0), 4))
     declared = changed(patterns, period_px=lambda pattern: {48.0: 49.0}.get(pattern.period_px, pattern.period_px))

@@ -4,6 +4,7 @@ noise are those of tests/reference/tof.py."""
 import numpy as np
 import pytest
 
+from tests.marks import first_short
 from tests.reference import tof
 from tests.scenes.depth import depth_of
 from tests.scenes.tof import cw_frames, write
@@ -77,7 +78,7 @@ def test_planes_with_texture_tell_that_phases_run_backwards(tmp_path, hz):
     assert "plane if the phases run backwards" in result.warnings[0]
 
 
-@pytest.mark.parametrize(("declared", "words"), [
+@first_short(("declared", "words"), [
     ({50e6: 52e6}, "52 MHz are 50 MHz"),
     ({60e6: 57e6}, "57 MHz are 60 MHz"),
     ({20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"),

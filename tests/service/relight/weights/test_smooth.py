@@ -64,7 +64,7 @@ def test_symmetric_lights_get_equal_parts(direction, device):
     np.testing.assert_allclose(got.solid_angle, 4 * np.pi / len(direction), atol=fold)
 
 
-@pytest.mark.parametrize("at", [(0, 5), (359, 700), (100, 33), (180, 360), (200, 500), (271, 3)])
+@first_short("at", [(0, 5), (359, 700), (100, 33), (180, 360), (200, 500), (271, 3)])
 def test_an_octahedron_shares_by_the_coordinates(at, device):
     """|x|, |y|, |z| over their sum."""
     direction = texel_directions(*HALF_DEGREE)[at]
@@ -102,7 +102,7 @@ def test_a_sun_at_a_light_is_its_own(direction, device):
         np.testing.assert_allclose(share[0], np.arange(len(direction)) == light, atol=1e-5)
 
 
-@pytest.mark.parametrize("direction", [icosahedron(), cap(60, 180), scattered(80, 2), CUBE, RINGS],
+@first_short("direction", [icosahedron(), cap(60, 180), scattered(80, 2), CUBE, RINGS],
                          ids=["icosahedron", "even", "any", "cube", "rings"])
 def test_shares_reproduce_the_direction(direction, device):
     """Σ share · light points at the sun, within a polygon too, because its imaginary light is in the middle of its corners."""

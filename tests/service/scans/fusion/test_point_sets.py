@@ -30,6 +30,12 @@ def clouds() -> list[Cloud]:
     return all_around(VIEWS, RAYS)
 
 
+@pytest.fixture(scope="module")
+def coarse() -> list[Cloud]:
+    """The first of these, and of the others a tenth of their points, where these are only looked at or refused."""
+    return all_around(1, RAYS) + all_around(VIEWS, RAYS // 10)[1:]
+
+
 def fused(file, **changes):
     return fuse_scans(file, file.parent / "out", voxel_m=VOXEL, **changes)
 
@@ -65,17 +71,17 @@ def test_points_and_range_images_make_one_surface(tmp_path, clouds):
 
 
 @pytest.mark.long
-def test_a_range_image_of_points_says_what_the_scanner_saw(tmp_path, clouds):
+def test_a_range_image_of_points_says_what_the_scanner_saw(tmp_path, coarse):
     """Each pixel lies on the true surface by what its σ says, in the world; σ is at most that of a point."""
-    file, listed = read_scan_set(write_set(tmp_path, [entry(clouds[0], tmp_path, 0)]))
+    file, listed = read_scan_set(write_set(tmp_path, [entry(coarse[0], tmp_path, 0)]))
     scan = as_range_image(read_scan(file, listed, 0), "cloud 0", device="cpu")
     world = scan.points @ scan.pose[:3, :3].T + scan.pose[:3, 3]
     off = distance(world)
     assert np.sqrt(np.median(off**2)) < 0.6745 * SIGMA
     assert np.median(scan.sigma) < SIGMA and (scan.sigma < 1.01 * SIGMA).mean() > 0.6  # the others lie at edges, 7 pixels to a part
-    viewpoint = clouds[0].world_from_file[:3, :3] @ clouds[0].viewpoint + clouds[0].world_from_file[:3, 3]
+    viewpoint = coarse[0].world_from_file[:3, :3] @ coarse[0].viewpoint + coarse[0].world_from_file[:3, 3]
     assert scan.pose[:3, 3] == pytest.approx(viewpoint, abs=1e-9)
-    assert 0.7 * len(clouds[0].points) < len(scan.points) < 1.2 * len(clouds[0].points)
+    assert 0.7 * len(coarse[0].points) < len(scan.points) < 1.2 * len(coarse[0].points)
 
 
 @pytest.mark.parametrize("voxel_pixels", [None, 1.0, 4.0, 8.0, 20.0])
@@ -97,8 +103,8 @@ def test_one_scan_of_a_wall_is_whole_whatever_the_voxels(tmp_path, voxel_pixels)
     assert np.sqrt((off**2).mean()) == pytest.approx(1, abs=0.25)  # the larger the pixels, the fewer: 484 of the largest
 
 
-def test_points_at_the_scanner_are_no_returns(tmp_path, clouds):
-    one = clouds[0]
+def test_points_at_the_scanner_are_no_returns(tmp_path, coarse):
+    one = coarse[0]
     more = one._replace(points=np.vstack([one.points, np.tile(one.viewpoint, (300, 1))]),
                         colours=np.vstack([one.colours, one.colours[:300]]))
     file, listed = read_scan_set(write_set(tmp_path, [entry(more, tmp_path, 0), entry(one, tmp_path, 1)]))
@@ -110,18 +116,18 @@ def test_points_at_the_scanner_are_no_returns(tmp_path, clouds):
         read_scan(file, listed, 0)
 
 
-def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
+def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, coarse):
     def refused(words: str, *entries: dict, error=RequestError):
         with pytest.raises(error, match=words):
             fused(write_set(tmp_path, list(entries)))
         assert not (tmp_path / "out").exists()
 
-    one = clouds[0]
+    one = coarse[0]
     refused(r"scans\[0\] \(cloud 0\): viewpoint_m is missing: cloud0.ply", entry(one, tmp_path, 0, viewpoint_m=None))
     inside = one.points.mean(axis=0)
     refused("the middle of what is seen from viewpoint_m; at most 55°",
             entry(one, tmp_path, 0, viewpoint_m=inside.tolist()))
-    all_sides = _in_one_file(clouds)
+    all_sides = _in_one_file(coarse)
     refused("points lie before or behind others as seen from viewpoint_m",
             entry(all_sides, tmp_path, 0))
     near = np.linalg.norm(one.points - one.points[0], axis=1) < 0.06
@@ -138,12 +144,12 @@ def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
     refused(r"viewpoint_m: depth.exr has a camera", {**listed[0], "path": "images/scan0", "viewpoint_m": [0, 0, 0]}, error=ManifestError)
 
 
-def test_normals_that_point_away_from_the_viewpoint_are_refused(tmp_path, clouds):
+def test_normals_that_point_away_from_the_viewpoint_are_refused(tmp_path, coarse):
     """From behind, each point of a scan can be seen but for the parts in front; only normals say that it shows the inside."""
-    normals = local_planes(clouds[0].points, origin=clouds[0].viewpoint).normals
-    behind = clouds[0].points.mean(axis=0) * 2 - clouds[0].viewpoint
-    said = entry(clouds[0], tmp_path, 0, viewpoint_m=behind.tolist())
-    write_ply(PointCloud((MM * clouds[0].points).astype(np.float32), clouds[0].colours, normals), tmp_path / said["path"])
+    normals = local_planes(coarse[0].points, origin=coarse[0].viewpoint).normals
+    behind = coarse[0].points.mean(axis=0) * 2 - coarse[0].viewpoint
+    said = entry(coarse[0], tmp_path, 0, viewpoint_m=behind.tolist())
+    write_ply(PointCloud((MM * coarse[0].points).astype(np.float32), coarse[0].colours, normals), tmp_path / said["path"])
     read, listed = read_scan_set(write_set(tmp_path, [said]))
     with pytest.raises(RequestError, match=r"\d\d% of its normals point away from viewpoint_m"):
         as_range_image(read_scan(read, listed, 0), "cloud 0", device="cpu")

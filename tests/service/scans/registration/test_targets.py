@@ -76,6 +76,7 @@ def test_too_few_targets_are_said():
     assert "looks the same" in found.alone[2]
 
 
+@pytest.mark.long
 def test_targets_on_the_table_do_not_move_an_object_that_was_pushed():
     """The surfaces of a figure determine its pose: targets that all moved against it are refused, and told."""
     views = [see(figure, pose(angle), rows=80, sigma=0.25 * MM, seed=k) for k, angle in enumerate((0.0, 30.0))]

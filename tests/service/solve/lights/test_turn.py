@@ -45,7 +45,8 @@ def solved(folder, name, turn, lights="declared"):
     return error, result.maps.sigma[known].astype(float), json.loads((folder / "out" / "report.json").read_text())
 
 
-@first_short("name", [*QUICK, "glossy"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", [*QUICK, "glossy"])
 def test_lights_that_are_declared_right_raise_no_doubt(tmp_path, name):
     _, _, report = solved(tmp_path, name, (0, 0, 0))
     assert "light_turn" not in report["found"] and not any("frames[]" in sentence for sentence in report["warnings"])

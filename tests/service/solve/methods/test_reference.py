@@ -7,6 +7,7 @@ import pytest
 
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.reference.sampling import lattice
 from tests.scenes.captures import angles_degrees, distant, edit_frame, edit_manifest, write_image, write_lit
 
@@ -144,7 +145,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@first_short("fault", FAULTS)
 def test_what_is_no_reference_is_refused(relit, captures, fault):
     change, words = FAULTS[fault]
     change(captures / "ball")
