@@ -68,8 +68,8 @@ def pytest_collection() -> Generator[None, object, object]:
 ONE_SERVER = ("tests/service/server/api", "tests/service/server/pages", "tests/service/client")
 """Folders whose tests share a server, which takes processor time as long as it runs: one process of the run has all of them, and ends the
 server after them."""
-OWN_SERVER = ("test_hooks.py", "test_operation_faults.py", "test_projector_page.py", "test_published_page.py", "test_reliability.py",
-              "test_set_page.py", "test_tokens.py", "test_traces.py")
+OWN_SERVER = ("test_operation_faults.py", "test_projector_page.py", "test_published_page.py", "test_reliability.py", "test_set_page.py",
+              "test_tokens.py", "test_traces.py")
 """Files of these folders that start servers of their own, or need none: any process of the run may have them."""
 PROGRAMS = ("clients", "server")
 """Folders of tests that start servers, browsers and other programs."""

@@ -166,6 +166,7 @@ def chart_patches(folder: Path) -> tuple[Path, np.ndarray, np.ndarray]:
     return folder / "patches.csv", reflectance, row * 6 + column
 
 
+@pytest.mark.long
 def test_a_chart_measures_lamps_and_how_the_camera_sees_it_under_each(relit, tmp_path):
     """Coloured patches reflect other parts of narrow primaries than their reflectances say; lamp 1 has half the power of the others."""
     stage = make_stage(3, 30)

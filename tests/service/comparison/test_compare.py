@@ -135,7 +135,8 @@ def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
         assert any("1.0030" in words and "times as large" in words for words in result.warnings)
 
 
-@first_short(("sides", "radius", "factor"), [
+@pytest.mark.long
+@pytest.mark.parametrize(("sides", "radius", "factor"), [
     (256, 15.0, 1.003), (256, 15.0, 0.998),
     (256, 15.1, 1.0), (24, 15.0, 1.0)])
 def test_what_is_larger_across_and_not_along_is_no_size_of_the_whole(tmp_path, sides, radius, factor):
@@ -293,7 +294,8 @@ def test_inputs_that_say_no_outside_or_no_σ_are_refused(tmp_path, part):
         compare(request(tmp_path, scan, concave))
 
 
-@first_short("sigma", [SIGMA_M, None])
+@pytest.mark.long
+@pytest.mark.parametrize("sigma", [SIGMA_M, None])
 def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part, sigma):
     made, design = part
     plain = scan_of(made, np.random.default_rng(7), 5000)

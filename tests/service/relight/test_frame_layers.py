@@ -154,6 +154,7 @@ def test_an_environment_alone_is_one_layer(lit):
     assert all(np.array_equal(channels[f"light_environment.{c}"], channels[c]) for c in "RGB")
 
 
+@pytest.mark.long
 def test_the_beauty_is_premultiplied_by_its_matte(relit, tmp_path):
     scene = render_covered(lights=16)
     folder = write_covered(tmp_path / "cap", scene, scene.coverage > 0.5)

@@ -9,7 +9,6 @@ import pytest
 from service.relight.model_range import LitModel, correction
 from service.reporting.provenance import HASHING
 from stage.stack.ingest import LAYOUT
-from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
@@ -49,7 +48,8 @@ def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
     assert guided < 0.5 * min(plain, kernel)
 
 
-@first_short("wrong", ["normals", "gloss"])
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", ["normals", "gloss"])
 def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
     """Normals that all face the camera, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain
     sum's. Turned normals are refused."""

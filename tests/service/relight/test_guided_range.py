@@ -92,6 +92,7 @@ def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
     assert SURFACE.off(frames[3], frames[1]) > 0.1
 
 
+@pytest.mark.long
 def test_a_turn_is_a_picture_that_is_moved(relit, scene, tmp_path):
     """By 10 of 96 columns, two frames of five. The moved map is cut into other samples, which fall elsewhere on the grid."""
     spin = "--frames", "1-8", "--spin-degrees", "150"

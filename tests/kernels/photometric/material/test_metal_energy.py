@@ -1,13 +1,13 @@
 """Metals whose pixels blur their lobe have the energy that their readings add up to, and the others stay as they are."""
 
 import numpy as np
+import pytest
 
 from kernels.photometric.material.material import fit_material
 from kernels.photometric.material.metal_energy import LEAST_PIXELS, with_whole_energy
 from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.material.test_mixtures import GOLD, metal
 from tests.kernels.photometric.test_svbrdf import sample, tilted
-from tests.marks import first_short
 from tests.scenes.glossy import sphere_directions
 
 LAMBERT = LobeShape()
@@ -31,7 +31,8 @@ def whole(samples, normal, materials):
     return materials if found is None else found
 
 
-@first_short(("count", "degrees"), [(128, 16.0), (128, 10.0), (48, 16.0)])
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "degrees"), [(128, 16.0), (128, 10.0), (48, 16.0)])
 def test_a_lobe_without_its_peak_gets_its_energy_back(device, count, degrees):
     """A lobe with the tail of the true one, which a robust fit finds. Within 5 %: sums over the lights stand for the energy of the lobe."""
     normal, lights = tilted(200, 60.0), sphere_directions(count)

@@ -12,7 +12,6 @@ from kernels.photometric.posterior.sampling import OPTIONS, Regime, SamplingFit,
 from kernels.photometric.search.hypotheses import LobeShape, search_normals
 from tests.kernels.photometric.sources import CENTRES, SHARPNESS, VIEW, readings_of, sphere, table_of
 from tests.kernels.scenes import angle_degrees
-from tests.marks import first_short
 from tests.reference import sampling as twin
 
 NORMALS = sphere(16)
@@ -119,7 +118,8 @@ def test_the_rings_find_the_diffuse_lobe_whatever_the_start(device, tables):
     assert (found.weights[:, 0] > 0).all() and found.weights.min() >= 0
 
 
-@first_short("alpha", [0.02, 0.12, 0.5])
+@pytest.mark.long
+@pytest.mark.parametrize("alpha", [0.02, 0.12, 0.5])
 def test_roughness_between_the_widths_of_the_table(device, tables, alpha):
     solve(LAMBERT[:3], device, tables)
     near = NORMALS[:, 2] > 0.5

@@ -6,7 +6,6 @@ import pytest
 from service.calibrate.solvers.mirror_ball import find_spot, nearest_point
 from service.light_estimation.ball import Ball, ball_from_mask, project, view_ball
 from stage.errors import CalibrationError
-from tests.marks import first_short
 from tests.reference.balls import mirror_of_far, render
 from tests.reference.light_directions import least_error_degrees
 from tests.scenes.captures import angles_degrees
@@ -53,7 +52,8 @@ def test_directions_behind(name):
         assert angles_degrees(spot.direction, direction) < max(0.1, spot.uncertainty_degrees)
 
 
-@first_short("name", SCENES)
+@pytest.mark.long
+@pytest.mark.parametrize("name", SCENES)
 def test_a_saturated_spot_with_noise(name):
     """Clipped four times over: the centroid of the plateau and its foot. The plateau's edge is quantised: 0.2°."""
     ball, view, geometry = exact(name)

@@ -1,6 +1,7 @@
 """A sweep whose images are out of step with its planes is told by the steps of its stripes."""
 
 import numpy as np
+import pytest
 
 from benchmarks.trials.laser import Case, cloth, grain, swept
 from tests.marks import first_short
@@ -19,7 +20,8 @@ def test_frames_that_are_out_of_step_are_as_unsure_as_they_are_wrong(slipped, te
     assert found.solved.mean() > 0.2 and (ratio > 5).mean() < 0.02
 
 
-@first_short("case", [Case("right", grain, planes=40), Case("a second plane", grain, planes=60, second=0.2, second_every=5),
+@pytest.mark.long
+@pytest.mark.parametrize("case", [Case("right", grain, planes=40), Case("a second plane", grain, planes=60, second=0.2, second_every=5),
                                   Case("the camera drifts", cloth, planes=60, drift_px=2.0)], ids=lambda case: case.name)
 def test_sweeps_in_step_are_not_accused(case):
     assert WORDS not in swept(case).note

@@ -185,7 +185,8 @@ def test_what_cannot_be_refined_is_refused(relit, tmp_path):
     relit("depth", tmp_path, "--out", tmp_path / "out", "--refine-projector").refused("one axis alone")
 
 
-@first_short("k", [(1.5, 0.0), (-1.0, 3.0)])
+@pytest.mark.long
+@pytest.mark.parametrize("k", [(1.5, 0.0), (-1.0, 3.0)])
 def test_a_lens_that_no_turn_explains_is_not_taken_for_one(relit, tmp_path, k):
     """As where boards were in the middle of the image alone: a projector turned by 30°, or of a negative focal length, was named."""
     written(tmp_path, None)

@@ -141,7 +141,8 @@ def test_an_inverse_pose_of_a_small_thing_gives_no_depth(relit, tmp_path):
     assert not DepthMaps.read(tmp_path / "out" / "depth.exr").mask.any()
 
 
-@pytest.mark.parametrize("times", [2.0, pytest.param(0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("times", [2.0, 0.5])
 def test_lines_of_sight_that_meet_by_chance_give_no_depth(relit, tmp_path, times):
     """A tenth of them met under another focal length, nearly all of these far off."""
     two_captures(tmp_path, 0.004)

@@ -63,6 +63,7 @@ def test_a_courtyard_of_coarse_points_is_placed(scans):
     assert np.linalg.norm(step[3:]) < 10e-3 and np.degrees(np.linalg.norm(step[:3])) < 0.2
 
 
+@pytest.mark.long
 def test_edges_do_not_count_as_wrong_normals(scans):
     """By how much the least determined direction is surer than normals alone would make it, with edges and without."""
     a, b = (prepare(scan, cell_m=0.2) for scan in scans)

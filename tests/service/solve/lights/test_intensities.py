@@ -9,7 +9,6 @@ from scipy.ndimage import gaussian_filter
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
 from tests.kernels.scenes import cap
-from tests.marks import first_short
 from tests.reference import microfacet as twin
 from tests.scenes import captures
 
@@ -168,8 +167,9 @@ def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path
     assert report["found"]["light_intensities"]["used"] == "estimated" and np.median(error) < 0.5, np.median(error)
 
 
-@first_short(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
-@first_short("degrees", [3, 1, 5])
+@pytest.mark.long
+@pytest.mark.parametrize(("gloss", "wrong"), [(0.3, 0), (0, 0.3)])
+@pytest.mark.parametrize("degrees", [3, 1, 5])
 def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_them(tmp_path, degrees, gloss, wrong):
     """As of a varnished picture: its normals were 22 to 29° off, by up to 61 σ, under right lights."""
     count, side = 12, 48
