@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.main import get_command
 
 from kernels.status import Status
-from service.cli.main import program
 from stage.capture.manifest import read_manifest
 from stage.sets.board import BoardDesign, BoardRegions, BoardScan, GaugeRuns
 from stage.sets.paste_limits import PasteLimits
@@ -16,9 +14,10 @@ from stage.sets.scan_set import ScanSet
 from stage.sets.tolerance_regions import Tolerances
 from stage.tof.calibration import Sweep, TofCalibration
 from stage.tof.scan import Scan
+from tests.service.conftest import made_program
 
 HOME = Path(__file__).parents[2]
-PROGRAM: Any = get_command(program())
+PROGRAM: Any = made_program()
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in (HOME / "README.md", *sorted((HOME / "docs").glob("*.md")))}
 SHOWN = {"inspection.md": [BoardScan, BoardDesign, BoardRegions, PasteLimits, GaugeRuns, Tolerances], "scans.md": [ScanSet],
          "time_of_flight.md": [TofCalibration, Sweep, Scan]}

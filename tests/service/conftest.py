@@ -2,7 +2,7 @@
 
 import sys
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from typer.main import get_command
@@ -35,8 +35,8 @@ class Outcome(NamedTuple):
 
 
 @cache
-def command(wanted: str) -> object:
-    """Return the program of a command as it is run, made once: to make it takes longer than many runs."""
+def made_program(wanted: str | None = None) -> Any:
+    """Return the program of a command, or all of it, as it is run, made once: to make it takes longer than many runs."""
     return get_command(program(wanted))
 
 
@@ -54,7 +54,7 @@ class Program:
         self._monkeypatch.setattr(ProgressBar, "stage", lambda _, name, total: recording.stage(name, total))
         self._monkeypatch.setattr(ProgressBar, "advance", lambda _, done: recording.advance(done))
         self._monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
-        self._monkeypatch.setattr("service.cli.main.program", command)
+        self._monkeypatch.setattr("service.cli.main.program", made_program)
         self._capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main()

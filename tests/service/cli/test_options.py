@@ -6,9 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from pydantic import BaseModel
-from typer.main import get_command
 
-from service.cli.main import program
 from service.requests import (
     acquire,
     basis,
@@ -40,6 +38,7 @@ from service.requests.imports.patterns import InterleavedImport
 from service.requests.imports.scans import ScansImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
 from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest
+from tests.service.conftest import made_program
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
@@ -88,7 +87,7 @@ OWN = {
 KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.RelightJob, "shade": jobs.ShadeJob, "export": jobs.ExportJob,
          "view": jobs.ViewJob}
 
-PROGRAM: Any = get_command(program())
+PROGRAM: Any = made_program()
 
 
 class Shown(NamedTuple):
