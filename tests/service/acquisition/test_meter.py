@@ -15,7 +15,6 @@ from service.acquisition.meter import OBJECT_PART, SHARE, TARGET, meter
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.formats import images
-from tests.marks import first_short
 from tests.scenes.captures import make_scene, write_exr
 from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, controller
@@ -61,7 +60,7 @@ def request(folder, stage, rig, exposure: float | None = None) -> AcquireRequest
                           trigger="shoot {exposure_s}", preview=True)
 
 
-@first_short("present", [0.01, 80.0])
+@pytest.mark.parametrize("present", [0.01, pytest.param(80.0, marks=pytest.mark.long)])
 def test_the_proposed_exposure_clips_less_than_a_thousandth_and_no_third_of_a_stop_is_given_away(tmp_path, stage, present):
     with controller(tmp_path, stage) as (rig, _):
         found = meter(request(tmp_path, stage, rig, present), refuse_to_ask)

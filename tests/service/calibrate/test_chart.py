@@ -13,7 +13,6 @@ from service.requests.chart import ChartKind, ChartRequest
 from stage.capture.capture import Capture
 from stage.colour.colour import rgb_matrix
 from stage.stack.correction import Correction
-from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, write_image
 from tests.scenes.chart import (
     CAMERA,
@@ -284,7 +283,7 @@ def test_lamps_of_several_primaries_have_a_matrix_each_and_a_narrow_one_is_refus
     assert (folder / "capture.json").read_bytes() == before
 
 
-@first_short("gap", [0.79, 0.94])
+@pytest.mark.parametrize("gap", [0.79, pytest.param(0.94, marks=pytest.mark.long)])
 def test_charts_with_other_gaps_are_found(gap, tmp_path):
     shown = picture(seen(), POSE, patch=47 * gap)
     found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))

@@ -11,6 +11,7 @@ from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.step import CAMERA, HEIGHT, LASER, Step, laser_planes, photograph
 
+pytestmark = pytest.mark.long
 PLANES = laser_planes(5)
 
 
@@ -30,7 +31,6 @@ def errors(folder):
     return np.array(rows).T
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("pose", "even"), [({}, True), ({"elevation": 30.0}, False), ({"elevation": 52.0, "turn": -10.0}, True),
                                             ({"turn": 20.0, "distance": 0.7}, False)])
 def test_planes_are_found_within_their_sigma(relit, tmp_path, pose, even):
@@ -44,7 +44,6 @@ def test_planes_are_found_within_their_sigma(relit, tmp_path, pose, even):
     assert tilts.max() < 3 and depths.max() < 3
 
 
-@pytest.mark.long
 def test_a_block_that_leans_is_within_what_is_said(relit, tmp_path):
     """Two standard deviations of the angle: depths are off by about one in a hundred."""
     folder = photograph(tmp_path / "step", Step(lean=0.5), PLANES)
@@ -53,7 +52,6 @@ def test_a_block_that_leans_is_within_what_is_said(relit, tmp_path):
     assert 0.004 < depth.max() < 0.015 and tilts.max() < 3 and depths.max() < 3
 
 
-@pytest.mark.long
 def test_several_poses_and_a_scan(relit, tmp_path):
     """What three poses tell together measures a scene of another one."""
     poses = [{}, {"elevation": 50.0, "turn": -12.0}, {"elevation": 34.0, "turn": 18.0, "distance": 0.65}]
@@ -72,7 +70,6 @@ def test_several_poses_and_a_scan(relit, tmp_path):
     assert maps.mask.sum() > 1000 and np.median(error) < 0.002
 
 
-@pytest.mark.long
 def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
     folder = photograph(tmp_path / "step", Step(), PLANES)
     before = (folder / "capture.json").read_bytes()

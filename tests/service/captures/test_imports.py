@@ -9,7 +9,6 @@ from scipy.io import savemat
 from service.captures.info import front_lights
 from stage.capture.capture import Capture
 from stage.results.maps import SurfaceMaps
-from tests.marks import first_short
 from tests.scenes import near_lights
 from tests.scenes.captures import make_scene, render, write_exr, write_image
 
@@ -34,7 +33,7 @@ def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path)
     assert degrees_between(maps.normal, scene.normal)[scene.mask].max() < 0.1  # half rounding of the stack
 
 
-@first_short("layout", ["lp", "olat"])
+@pytest.mark.parametrize("layout", ["lp", pytest.param("olat", marks=pytest.mark.long)])
 def test_the_scale_of_the_lights_gives_that_of_albedo(relit, tmp_path, layout):
     """`--scale` is the reading of a white surface that faces a light: albedo is then the true one, and relative without it."""
     scene, reading = make_scene(24, 8), 0.37

@@ -13,7 +13,6 @@ from stage.capture.capture import Capture
 from stage.capture.lighting import check_solvable
 from stage.errors import ManifestError
 from stage.formats import exr
-from tests.marks import first_short
 from tests.scenes import near_lights
 from tests.scenes.captures import edit_frame, make_scene, manifest_of, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.ellipsoid import ellipsoid
@@ -162,7 +161,7 @@ def test_a_right_manifest_has_no_finding(tmp_path, encode, declared):
     assert findings(tmp_path, encode(SCALED), color_space=declared) == []
 
 
-@first_short("encode", [srgb, lambda values: values ** (1 / 2.2)], ids=["sRGB", "power"])
+@pytest.mark.parametrize("encode", [srgb, pytest.param(lambda values: values ** (1 / 2.2), marks=pytest.mark.long)], ids=["sRGB", "power"])
 def test_encoded_images_that_are_declared_linear_are_named(tmp_path, encode):
     """The curves of sRGB and of a power of 2.2 differ by less than these pixels tell."""
     (finding,) = findings(tmp_path, encode(SCALED))

@@ -12,7 +12,6 @@ from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.errors import ManifestError, ResultError, ScanError
-from tests.marks import first_short
 from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_mesh, write_scan, write_stl
 
 REGIONS = [{"name": "top", "facing": [0, 0, 1], "tolerance": [-0.08, 0.08]},
@@ -136,9 +135,7 @@ def test_a_scan_that_is_too_large_as_a_whole_is_said(tmp_path, part, factor):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("sides", "radius", "factor"), [
-    (256, 15.0, 1.003), (256, 15.0, 0.998),
-    (256, 15.1, 1.0), (24, 15.0, 1.0)])
+@pytest.mark.parametrize(("sides", "radius", "factor"), [(256, 15.0, 1.003), (256, 15.0, 0.998), (256, 15.1, 1.0), (24, 15.0, 1.0)])
 def test_what_is_larger_across_and_not_along_is_no_size_of_the_whole(tmp_path, sides, radius, factor):
     """A bar that is too thick and exactly as long, and a design with flats in place of the round, are no error of the scanner."""
     seen = scan_of(cylinder(256, radius), np.random.default_rng(6), 6000)
@@ -235,7 +232,7 @@ def box(x, y, z) -> Part:
                                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
 
 
-@first_short(("thick", "depth"), [(1, 0.7), (3, 2.5)])
+@pytest.mark.parametrize(("thick", "depth"), [(1, 0.7), pytest.param(3, 2.5, marks=pytest.mark.long)])
 def test_the_floor_of_a_pocket_near_the_other_side_of_a_wall_is_not_overlooked(tmp_path, thick, depth):
     made = box(80, 50, thick)
     scan = scan_of(made, np.random.default_rng(7), 40_000, None, None,

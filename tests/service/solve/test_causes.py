@@ -10,7 +10,6 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.formats import images
 from stage.results.maps import SurfaceMaps
-from tests.marks import first_short
 from tests.scenes import captures
 
 
@@ -92,7 +91,7 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     assert np.array_equal(some.maps.mask, written.mask)
 
 
-@first_short(("lights", "exposures", "method"), [(5, 3, "robust"), (14, 1, "svbrdf")])
+@pytest.mark.parametrize(("lights", "exposures", "method"), [(5, 3, "robust"), pytest.param(14, 1, "svbrdf", marks=pytest.mark.long)])
 def test_exposures_of_one_light_do_not_make_a_capture_one_of_many_lights(tmp_path, lights, exposures, method):
     """Fifteen images of five lights say no more about a material than five do."""
     folder = captures.write_capture(tmp_path / "capture", captures.make_scene(size=16, lights=lights))

@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.status import Status
 from tests.kernels.scenes import GREY, angle_degrees, cap, colours, rounding_bounds, shade, solve
-from tests.marks import first_short
 from tests.reference import photometric as reference
 
 FLOAT32_DEGREES = 1e-4
@@ -68,7 +67,7 @@ def noisy(pixels, lights, noise, seed, *, quantised=False, spoiled=True):
 
 
 @pytest.mark.parametrize("lights", [5, 10, 13, 40, 97])
-@first_short("quantised", [False, True], ids=["continuous", "8 bit"])
+@pytest.mark.parametrize("quantised", [False, pytest.param(True, marks=pytest.mark.long)], ids=["continuous", "8 bit"])
 def test_values_are_those_of_the_twin_on_noisy_data(quantised, lights, device):
     radiance, direction, irradiance = noisy(200, lights, 0.05, lights, quantised=quantised)
     solved = solve(solve_robust, radiance, direction, irradiance, device)

@@ -9,7 +9,6 @@ from kernels.tof.histogram.pileup import correct_pileup, place, without_pileup
 from kernels.tof.histogram.pulse import gaussian, measured
 from kernels.tof.histogram.pulse_width import estimate_pulse
 from kernels.tof.histogram.returns import find_returns
-from tests.marks import first_short
 from tests.reference import tof
 
 BIN_S, SIGMA_S = 1.5e-9, 1.2e-9
@@ -38,7 +37,7 @@ def test_without_noise_ranges_are_exact_between_the_bins(device):
     np.testing.assert_allclose(found["background"], 0.5, atol=0.04)  # the table ends where 7 in a million of a return are left
 
 
-@first_short(("part", "median_m"), [(1.0, 0.020), (0.2, 0.046)])
+@pytest.mark.parametrize(("part", "median_m"), [(1.0, 0.020), pytest.param(0.2, 0.046, marks=pytest.mark.long)])
 def test_noise_figures_of_the_room(part, median_m, device):
     """Reach: median error with 4000 counts at one metre, and a fifth of it; sigma against what is observed."""
     view = tof.room()

@@ -9,6 +9,7 @@ from kernels.tof.histogram.pulse import gaussian
 from kernels.tof.histogram.returns import find_returns
 from tests.reference import tof
 
+pytestmark = pytest.mark.long
 BINS = 64
 
 
@@ -41,7 +42,6 @@ def fifths(error, sigma):
     return [(error / sigma)[part] for part in np.array_split(np.argsort(sigma), 5)]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "background", "low", "high"), [
     (0.8, 0.02, 5, 60), (0.8, 60.0, 60, 400), (4.0, 2.0, 30, 300), (0.3, 0.5, 8, 100)])
 def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, device):
@@ -57,7 +57,6 @@ def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, dev
         assert np.sqrt(np.mean(np.clip(part, -4, 4) ** 2)) == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "photons"), [(0.05, 20.0), (0.1, 2000.0), (0.2, 20.0)])
 def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, device):
     """Errors are even over what the bin leaves open there, and not normal: RMS alone."""
@@ -70,7 +69,6 @@ def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, de
         assert np.sqrt(np.mean(np.clip(part, -4, 4) ** 2)) == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("photons", "pulses"), [(400, 2000), (400, 500), (2000, 500)])
 def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
     """At four photons a pulse the logarithm of what is left makes errors 1.4 times those of Poisson counts."""
@@ -81,7 +79,6 @@ def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
     assert 1.4826 * np.median(np.abs(part)) == pytest.approx(1, abs=0.04)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("apart", [2.5, 3.0, 6.0])
 def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, device):
     """Pulses of two bins, `apart` of their standard deviations apart."""
@@ -97,7 +94,6 @@ def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, d
         assert 1.4826 * np.median(np.abs(part)) == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "photons", "pulses"), [(0.8, 8, None), (0.8, 100, None), (0.15, 12, None), (3.0, 40, None),
                                                                (0.8, 900, 300)])
 def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
@@ -112,7 +108,6 @@ def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
         assert spread == pytest.approx(sigma, rel=0.05)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("background", "low", "high", "clear", "pixels"), [(0.05, 1, 40, 12, 100000), (2.0, 3, 80, 30, 250000)])
 def test_confidence_is_how_often_the_peak_is_right(background, low, high, clear, pixels, device):
     """Every other pixel has no return: those that are accepted and wrong are as many as confidence says. There are more than 30 of them,

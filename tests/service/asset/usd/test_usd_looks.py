@@ -9,7 +9,6 @@ from pxr import Usd, UsdGeom, UsdShade, Vt
 from service.asset.usd.asset import write_asset
 from service.asset.usd.inspect import inspect_usd
 from stage.formats.images import write_png
-from tests.marks import first_short
 
 MESH, MATERIAL = "/Kugel/Geom/Mesh", "/Kugel/Looks/Material"
 
@@ -73,7 +72,7 @@ def test_an_extent_that_the_points_do_not_fill_is_an_error(ball, factor, wrong, 
     assert any(re.search(rf"{MESH}\.extent: is from \(.*\), and the geometry from \(", each) for each in errors) == wrong
 
 
-@first_short("bits", [8, 16])
+@pytest.mark.parametrize("bits", [8, pytest.param(16, marks=pytest.mark.long)])
 @pytest.mark.parametrize("entry, space, words", [
     ("diffuseColor", "sRGB", None), ("roughness", "raw", None),
     ("diffuseColor", "raw", "diffuseColor: .* is read as raw, and colours of 8 bits are mostly sRGB"),

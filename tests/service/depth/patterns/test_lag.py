@@ -11,6 +11,7 @@ from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from tests.scenes.depth import depth_of
 
+pytestmark = pytest.mark.long
 RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)
 SHAPES = (Wall((0, 0, -1.4), (0.3, -0.2, 1), 0.6, texture=0.4), Ball((-0.1, 0.05, -1.1), 0.16, 0.7, texture=0.6))
 PATTERNS = {"waves": phase_patterns("column", (16, 18, 21), 4),
@@ -36,7 +37,6 @@ def solve(folder, seen, patterns, **world):
     return np.abs(maps.depth - seen.depth)[known] / maps.sigma[known], any(WORDS in text for text in found.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("waves"), pytest.param("wave and Gray"), pytest.param("micro", marks=pytest.mark.long)])
 def test_light_below_the_surface_is_in_sigma_and_said(tmp_path, light, name):
     off, said = solve(tmp_path, light, PATTERNS[name], scattered=0.5, scatter_px=4.0, flights=2)
@@ -44,7 +44,6 @@ def test_light_below_the_surface_is_in_sigma_and_said(tmp_path, light, name):
     assert said and np.median(off) < 1.4 and (off > 5).mean() < 0.01
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", PATTERNS)
 @pytest.mark.parametrize(("scattered", "scatter_px", "flights"), [(0.3, 8.0, 3), (0.7, 2.0, 2), (0.3, 5.0, 1)])
 def test_other_matter(tmp_path, light, name, scattered, scatter_px, flights):
@@ -52,7 +51,6 @@ def test_other_matter(tmp_path, light, name, scattered, scatter_px, flights):
     assert said and np.median(off) < 1.4 and (off > 5).mean() < 0.01
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("name", "world"), [("waves", {"blur_px": 1.5}), *(
     pytest.param(name, world, marks=pytest.mark.long) for name in PATTERNS for world in (
         {}, {"blur_px": 2.0}, {"light": 0.3}, {"read_noise": 0.006, "electrons": 2500.0}))])
@@ -91,7 +89,6 @@ def fold(albedo: float) -> Light:
                          weight=np.concatenate([seen.weight, weight[pixel, of]]))
 
 
-@pytest.mark.long
 def test_much_of_the_light_that_bounces_in_a_fold_is_in_sigma(tmp_path):
     seen, world = fold(0.8), World(shapes=(), rig=FOLD, read_noise=0.001, electrons=60000.0, bits=16)
     write_capture(tmp_path, world, PATTERNS["waves"], light=seen)

@@ -19,6 +19,7 @@ from tests.scenes.depth import entry_of
 from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
 from tests.service.depth.stereo.test_stereo import pixels_off, solve
 
+pytestmark = pytest.mark.long
 WALL, BALL = Plane((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Sphere((-0.06, 0.05, -0.88), 0.1, 0.55)
 ABOVE = np.eye(4)
 ABOVE[:3, 3] = (0.01, 0.1, 0.0)
@@ -40,7 +41,6 @@ def recorded(view, seed, **noise):
     return [scenes.recorded(image, rng, **noise) for image in view.images]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("textures", "cell", "noise"), [
     (1, 3, {}), (3, 4, {"read": 0.008, "photons": 3000.0}), (2, 5, {"read": 0.001, "photons": 1e5})])
 def test_sigma_is_that_of_the_true_error(relit, tmp_path, textures, cell, noise):
@@ -54,7 +54,6 @@ def test_sigma_is_that_of_the_true_error(relit, tmp_path, textures, cell, noise)
     assert (~right_ones).mean() < 0.005
 
 
-@pytest.mark.long
 def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
     left, right = pair((WALL, BALL))
     ours, theirs = recorded(left, 3), recorded(right, 4)
@@ -81,7 +80,6 @@ def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
     assert (maps.mask & (np.abs(mine) > 1)).sum() < 0.5 * (known & (np.abs(its) > 1)).sum()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("textures", [1, 4])
 def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
     bars = [Rectangle(x, (-0.3, 0.3), depth) for x, depth in (((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9))]
@@ -95,7 +93,6 @@ def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
     assert (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("pose", [ABOVE, TO_THE_LEFT], ids=["above", "to the left"])
 def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
     left, right = pair((WALL, BALL), 1, 3, pose)
@@ -105,7 +102,6 @@ def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
     assert np.sqrt(np.mean(off[maps.mask & (off < 1)] ** 2)) < 0.1
 
 
-@pytest.mark.long
 def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
     parts = Plane((0, 0, -1.2), (0.1, 0.05, 1)), Rectangle((-0.1, 0.05), (-0.12, 0.1), 0.85)
     left, right = pair(parts)
@@ -129,7 +125,6 @@ def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
     assert np.median(three.sigma[common]) < 0.85 * np.median(two.sigma[common])
 
 
-@pytest.mark.long
 def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
     """Texture and lights in one capture: `solve`, `depth` and `join` speak of the same pixels."""
     left, right = pair((WALL, BALL), 3)
@@ -158,7 +153,6 @@ def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
     assert both.mean() > 0.7 and after < before
 
 
-@pytest.mark.long
 def test_bands_of_rows_agree_with_the_whole_image(relit, tmp_path, monkeypatch):
     left, right = pair((WALL, BALL))
     folder = scenes.write_pair(tmp_path, recorded(left, 14), recorded(right, 15))

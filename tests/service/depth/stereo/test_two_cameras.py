@@ -11,7 +11,6 @@ from service.depth.stereo.row_offsets import row_offsets
 from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast
 from stage.formats.images import write_png
 from stage.results.depth_maps import DepthMaps
-from tests.marks import first_short
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.depth import (
@@ -64,7 +63,7 @@ def measured(relit, folder, *options):
     return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
-@first_short(("noise", "most"), [(0.0, 1e-3), (0.004, 4e-3)])
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 1e-3), pytest.param(0.004, 4e-3, marks=pytest.mark.long)])
 def test_depth_is_that_of_the_cameras(relit, tmp_path, noise, most):
     """The projector of the manifests has a size and nothing else. Of 1.4 m, planes through 5 × 5 pixels of a sphere are off by
     1 mm, at its rim by a centimetre."""

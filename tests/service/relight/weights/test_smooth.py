@@ -102,8 +102,7 @@ def test_a_sun_at_a_light_is_its_own(direction, device):
         np.testing.assert_allclose(share[0], np.arange(len(direction)) == light, atol=1e-5)
 
 
-@first_short("direction", [icosahedron(), cap(60, 180), scattered(80, 2), CUBE, RINGS],
-                         ids=["icosahedron", "even", "any", "cube", "rings"])
+@first_short("direction", [icosahedron(), cap(60, 180), scattered(80, 2), CUBE, RINGS], ids=["icosahedron", "even", "any", "cube", "rings"])
 def test_shares_reproduce_the_direction(direction, device):
     """Σ share · light points at the sun, within a polygon too, because its imaginary light is in the middle of its corners."""
     for seed in range(20):

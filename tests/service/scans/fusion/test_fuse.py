@@ -18,6 +18,7 @@ from tests.scenes.register import fuse_scans
 from tests.scenes.statue import SIGMA, colour_of, distance, shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
+pytestmark = pytest.mark.long
 VOXEL = 4e-3
 OFF = 5e-3
 """By how far one scan is put beside its place."""
@@ -38,7 +39,6 @@ def fused(tmp_path_factory, shots):
     return fuse_scans(file, folder / "out", voxel_m=VOXEL)
 
 
-@pytest.mark.long
 def test_the_fused_statue_is_better_than_its_scans(fused):
     ply = read_ply_points(fused.mesh_path)
     error = distance(ply.points)
@@ -51,7 +51,6 @@ def test_the_fused_statue_is_better_than_its_scans(fused):
     assert fused.facts["holes"]["edges_of_more_than_two_faces"] == 0
 
 
-@pytest.mark.long
 def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
     ply = read_ply_points(fused.mesh_path)
     assert ply.colours is not None and ply.normals is not None
@@ -61,7 +60,6 @@ def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
     assert np.median((ply.normals * true).sum(axis=1)) > np.cos(np.radians(5))  # 25 pixels with .25 mm of noise give 1°, bends more
 
 
-@pytest.mark.long
 def test_the_report_lists_the_holes_and_what_was_seen(fused):
     facts = json.loads(fused.report_path.read_text())
     holes = facts["holes"]
@@ -73,7 +71,6 @@ def test_the_report_lists_the_holes_and_what_was_seen(fused):
     assert all(0.3 < scan["residual_median_sigmas"] < 1.2 for scan in facts["scans"])
 
 
-@pytest.mark.long
 def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots]
     poses[4][:3, 3] += OFF * poses[4][:3, 0]
@@ -86,7 +83,6 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
 
 
-@pytest.mark.long
 def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     """The mesh is to the last byte that of the set without the second one, its σ with it."""
     file = write_scans(tmp_path / "once", shots[:3])
@@ -100,7 +96,6 @@ def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     assert twice.mesh_path.read_bytes() == once.mesh_path.read_bytes()
 
 
-@pytest.mark.long
 def test_a_scan_without_overlap_is_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots[:3]]
     poses[2][0, 3] += 3.0
@@ -110,7 +105,6 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     assert warning.startswith("scan view 2: ")
 
 
-@pytest.mark.long
 def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
     file = write_scans(tmp_path, shots[::5], coloured=True)
     measured, closed = (fuse_scans(file, tmp_path / close, voxel_m=2 * VOXEL, close=close) for close in ("none", "all"))
@@ -127,7 +121,6 @@ def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
         FuseRequest(scan_set=file, out=tmp_path / "tiles", close="all", tiles=True)
 
 
-@pytest.mark.long
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     def refused(words, scan_set, **changes):
         with pytest.raises((RequestError, AssetError), match=words):
@@ -151,7 +144,6 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("mixed", [False, True])
 def test_range_images_of_orthographic_cameras_are_fused(tmp_path, shots, mixed):
     """Cameras whose frame lies in the middle of the statue, so that half of the depths are below 0; every third is perspective if mixed."""
@@ -183,7 +175,6 @@ def _moved(by: float) -> np.ndarray:
     return pose
 
 
-@pytest.mark.long
 def test_joined_maps_replace_the_depth_by_a_better_one(tmp_path):
     """Depths of 2 mm of noise beside heights of .1 mm, as `relit join` leaves them."""
     noise, joined = 2e-3, 1e-4

@@ -13,6 +13,7 @@ from tests.service.server.api.job_calls import NOBODY, refused, submit
 from tests.service.server.api.test_watch import queue
 from tests.service.server_process import serving
 
+pytestmark = pytest.mark.long
 WAIT_S = 60.0
 
 
@@ -36,7 +37,6 @@ def watched(client: httpx2.Client, job: str, **headers: str) -> list[dict]:
         return list(told(response.iter_lines()))
 
 
-@pytest.mark.long
 def test_a_job_is_followed_to_its_end(server, client, dome, sky):
     job = client.post("/v1/jobs", json={"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-60"}}).json()
     found = watched(client, job["id"])
@@ -62,7 +62,6 @@ def test_a_job_is_followed_to_its_end(server, client, dome, sky):
     assert [event["data"] for event in beyond] == [views[-1]]
 
 
-@pytest.mark.long
 def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
     request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-300"}}
     job = client.post("/v1/jobs", json=request).json()["id"]
@@ -80,7 +79,6 @@ def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
         client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
 
 
-@pytest.mark.long
 def test_all_jobs_of_a_project_are_watched_at_once(server, client, dome):
     with client.stream("GET", "/v1/events") as response:
         found = told(response.iter_lines())
@@ -93,14 +91,12 @@ def test_all_jobs_of_a_project_are_watched_at_once(server, client, dome):
             assert time.monotonic() < deadline
 
 
-@pytest.mark.long
 def test_a_stream_that_cannot_be_is_refused(client, solved):
     refused(client.get(f"/v1/jobs/{NOBODY}/events"), 404, NOBODY)
     response = client.get(f"/v1/jobs/{solved}/events", headers={"Last-Event-ID": "now"})
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
-@pytest.mark.long
 def test_streams_end_with_the_service(tmp_path: Path):
     with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
         with server.database() as database:
@@ -113,7 +109,6 @@ def test_streams_end_with_the_service(tmp_path: Path):
         assert server.process.wait(WAIT_S) == 0
 
 
-@pytest.mark.long
 def test_streams_stay_open_while_postgresql_restarts(tmp_path: Path, server_postgres):
     with (serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server,
           server.client() as client, server.database() as database):

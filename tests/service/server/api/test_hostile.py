@@ -32,7 +32,7 @@ from tests.service.server.api.captures import (
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted, finish, submit
 
-pytestmark = pytest.mark.usefixtures("worker_lives")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("worker_lives")]
 
 
 def edited(**more: object) -> Callable[[Path], None]:
@@ -148,7 +148,6 @@ THROUGH = ("parent", "nul", "step link", "pipe", "truncated", "billion exr", "bi
 """Those that go through the service: one for each way in which a check could cost the worker. The others are checked here."""
 
 
-@pytest.mark.long
 def test_hostile_captures_are_refused_by_name(server, client, registered):
     made = {}
     for number, (what, (change, _)) in enumerate(HOSTILE.items()):
@@ -172,7 +171,6 @@ def test_hostile_captures_are_refused_by_name(server, client, registered):
         assert problem.isprintable() and len(faults) <= MOST_FAULTS + 1 and max(map(len, faults)) < 400
 
 
-@pytest.mark.long
 def test_hostile_environments_are_refused_by_name(server, client, registered):
     folder = registered / "environments"
     folder.mkdir()
@@ -184,7 +182,6 @@ def test_hostile_environments_are_refused_by_name(server, client, registered):
         assert sentence in admitted(server, client, folder / name, "refused", kind="environments")["problem"]
 
 
-@pytest.mark.long
 def test_fuzzed_images_through_uploads(server, client, tus, tmp_path):
     """A quarter is cut short, which the check always sees; of the others it lets through what only decoding tells."""
     source = write_capture(tmp_path / "source")
@@ -215,7 +212,6 @@ def test_fuzzed_images_through_uploads(server, client, tus, tmp_path):
         assert ended["error"] is None or "001.exr" in ended["error"], ended["error"]
 
 
-@pytest.mark.long
 def test_a_registered_capture_that_changed_is_not_read(server, client, registered):
     folder = write_capture(registered / "changing")
     capture = admitted(server, client, folder)["id"]

@@ -6,8 +6,9 @@ import pytest
 from tests.service.server.api.job_calls import NOBODY, finish, has_made, made_by, refused, submit
 from tests.service.waiting import until
 
+pytestmark = pytest.mark.long
 
-@pytest.mark.long
+
 def test_a_job_that_fails_says_why_and_is_tried_again(server, client, dome):
     job = submit(client, kind="depth", capture=dome)  # has lights, and no patterns
     failed = finish(server, client, job, "failed")
@@ -20,7 +21,6 @@ def test_a_job_that_fails_says_why_and_is_tried_again(server, client, dome):
     assert finish(server, client, job, "failed")["error"] == failed["error"]
 
 
-@pytest.mark.long
 def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, dome):
     job = submit(client, **long)
     has_made(client, job, 2)
@@ -39,7 +39,6 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     assert not (server.data / "projects/default/jobs" / job["id"]).exists()
 
 
-@pytest.mark.long
 def test_a_job_that_is_deleted_while_it_runs_is_no_error_in_the_log(server, client, dome, long):
     """DBOS wrote a traceback, also since the workflow that it ends is not there any more."""
     job = submit(client, **long)["id"]
@@ -51,7 +50,6 @@ def test_a_job_that_is_deleted_while_it_runs_is_no_error_in_the_log(server, clie
     assert [line for line in server.lines() if line["level"] == "error"] == []
 
 
-@pytest.mark.long
 def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-24", "spin_degrees": 360}}
     job = submit(client, **request, name="slow")
@@ -70,7 +68,6 @@ def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {path.name: path.read_bytes() for path in undisturbed.iterdir()}
 
 
-@pytest.mark.long
 def test_the_highest_priority_goes_first(server, client, long, dome):
     before = submit(client, **long, priority=100)
     has_made(client, before, 1)  # the worker is busy
@@ -99,7 +96,6 @@ def texts(client: httpx2.Client, job: dict) -> list[str]:
     return [f"{entry['attempt']} {entry['text']}" for entry in entries]
 
 
-@pytest.mark.long
 def test_the_log_says_what_happened_and_goes_with_its_job(server, client, dome, long):
     solved = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
     found = texts(client, solved)

@@ -13,12 +13,13 @@ import pytest
 from service.server.database import jobs, workers
 from tests.service.server.jobs.harness import PROJECT, digests, harness
 
+pytestmark = pytest.mark.long
+
 
 def frames_there(made, job, count):
     made.until(lambda: made.frames_there(job) >= count, f"{count} frames", every_s=0.002)
 
 
-@pytest.mark.long
 def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postgres, undisturbed):
     with harness(tmp_path, on_postgres, takeover_s=0.5) as made:
         for _ in range(2):
@@ -34,7 +35,6 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
         assert [event for event in made.events() if event["event"] in ("worker died", "worker is gone")] == []
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("how", ["stopped", "in a step"])
 def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
     with harness(tmp_path, stall_s=10, takeover_s=0.5) as made:  # a worker on a loaded machine takes some seconds to begin
@@ -52,7 +52,6 @@ def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undistur
         assert any(event["event"] == "worker hangs: it is killed" for event in made.events())
 
 
-@pytest.mark.long
 def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(tmp_path, on_postgres, undisturbed):
     with harness(tmp_path, on_postgres) as made:
         worker = made.start("slow")
@@ -70,7 +69,6 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         made.made_whole(job, undisturbed)
 
 
-@pytest.mark.long
 def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
     with harness(tmp_path, drain_s=1) as made:
         worker = made.start("hang")
@@ -83,7 +81,6 @@ def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
         assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
 
 
-@pytest.mark.long
 def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
     with harness(tmp_path) as made:
         worker = made.start("slow")
@@ -97,7 +94,6 @@ def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbe
         made.until(lambda: any(event["event"] == "worker ended" for event in made.events()), "ended")
 
 
-@pytest.mark.long
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
     with harness(tmp_path, max_lost=1, takeover_s=0.2) as made:
         made.start("kill")
@@ -137,7 +133,6 @@ def fill(folder: Path, *, leave: int) -> Path:
     return ballast
 
 
-@pytest.mark.long
 def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_space(small_disk, tmp_path, on_postgres, undisturbed):
     with harness(small_disk, on_postgres, roots=str(undisturbed.capture.parent), min_free_bytes="0") as made:
         made.log = tmp_path / "log.txt"
@@ -162,7 +157,6 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
 WORKERS = 2
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("database_url", "kills"), [
     ("sqlite", 1), pytest.param("postgresql", 3, marks=pytest.mark.long),
 ], indirect=["database_url"])

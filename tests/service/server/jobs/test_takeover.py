@@ -10,7 +10,6 @@ from service.server.database.jobs import Claim
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.queue import workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, LockState, Takeover, open_worker_lock
-from tests.marks import first_short
 from tests.service.server.jobs.harness import harness
 
 MAX_LOST = 3
@@ -40,7 +39,7 @@ def takeover(idle_harness):
         lock.close()
 
 
-@first_short("cancelled", [False, True], ids=["going on", "cancelled"])
+@pytest.mark.parametrize("cancelled", [False, pytest.param(True, marks=pytest.mark.long)], ids=["going on", "cancelled"])
 def test_a_dead_workers_job_waits_for_another_or_is_called_off(idle_harness, takeover, job, cancelled):
     if cancelled:
         idle_harness.database.transact(lambda connection: jobs.cancel(connection, job))

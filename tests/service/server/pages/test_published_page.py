@@ -13,6 +13,7 @@ from tests.service.publish.published import Files, served, shown
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, new_context, seen
 
+pytestmark = pytest.mark.long
 MOST_BYTES = 2_000_000
 """What the page may weigh until its first picture, tiles included."""
 SMALL = {"width": 900, "height": 480}
@@ -55,7 +56,6 @@ def picture(page) -> np.ndarray:
     return cv2.imdecode(np.array(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] / 255
 
 
-@pytest.mark.long
 def test_the_page_shows_the_sample_as_openlime_would(owl, page, tmp_path):
     planes, address = owl
     Files.sent = 0
@@ -77,7 +77,6 @@ def test_the_page_shows_the_sample_as_openlime_would(owl, page, tmp_path):
         assert 255 * np.sqrt(np.mean(np.square(found - wanted))) < 3
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 def test_the_address_keeps_what_is_shown(owl, page):
     page.goto(owl[1])
@@ -102,7 +101,6 @@ def test_the_address_keeps_what_is_shown(owl, page):
     page.wait_for_function("document.querySelector('#embed textarea').value.includes('?embed#light')")
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 @pytest.mark.parametrize("viewport", [(1000, 500), (390, 600)])
 def test_the_page_can_be_used_by_everybody(owl, page, viewport):
@@ -113,7 +111,6 @@ def test_the_page_can_be_used_by_everybody(owl, page, viewport):
     assert violations(page) == []
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl, page):
     page.goto(owl[1])
@@ -139,7 +136,6 @@ def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl,
     expect(frame.locator("h1:visible")).to_have_count(0)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 def test_the_first_picture_needs_a_part_of_what_a_line_carries_in_two_seconds(owl, page):
     """Bytes, not seconds: 10 Mbit/s carry 2.5 MB in two; the finer tiles are held back until the first picture is there."""
@@ -154,7 +150,6 @@ def test_the_first_picture_needs_a_part_of_what_a_line_carries_in_two_seconds(ow
     picture(page)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 def test_one_finger_moves_the_light_or_the_picture(owl, page):
     page.goto(f"{owl[1]}#light=0,0")
@@ -176,7 +171,6 @@ def test_one_finger_moves_the_light_or_the_picture(owl, page):
     assert re.search(r"light=0\.(49|5|51)\d*,", page.evaluate("location.hash"))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", [True], indirect=True)
 def test_two_fingers_zoom(owl, page):
     page.goto(owl[1])
@@ -191,7 +185,6 @@ def test_two_fingers_zoom(owl, page):
     page.wait_for_function("Math.abs(Number(location.hash.match(/zoom=([\\d.]+)/)?.[1]) - 2) < .04")
 
 
-@pytest.mark.long
 def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):
     context = new_context(browser)
     page = context.new_page()

@@ -20,6 +20,7 @@ from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, keep,
 from tests.service.server_process import serving
 from tests.service.twin_program import twin_running
 
+pytestmark = pytest.mark.long
 LAMPS = 7
 DEAD = "dead@5,dead@6,dead@7"
 """The releases at which no lamp shines: a dark picture and the chart are the first, so this is the third lamp, at every attempt."""
@@ -67,7 +68,6 @@ def assert_accessible(page) -> None:
         page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
 
 
-@pytest.mark.long
 def test_only_programs_of_this_machine_reach_the_stage_and_bad_input_is_refused(tmp_path, relit):
     with stage(tmp_path) as (server, _), server.client() as client:
         good = {"name": "one", "plan": "olat"}
@@ -90,7 +90,6 @@ def test_only_programs_of_this_machine_reach_the_stage_and_bad_input_is_refused(
         assert "--camera" in relit.refused(*refused, *alone)
 
 
-@pytest.mark.long
 def test_where_there_are_keys_an_administrator_alone_takes_captures_from_anywhere(browser, tmp_path, relit):
     """Under another name, as a tablet beside the stage asks for it; pictures come with the key too."""
     with stage(tmp_path, serve=("--device", "none", "--keys-only")) as (server, _):
@@ -112,7 +111,6 @@ def test_where_there_are_keys_an_administrator_alone_takes_captures_from_anywher
         context.close()
 
 
-@pytest.mark.long
 def test_from_the_first_click_to_an_asset(browser, tmp_path):
     """With the keyboard alone; the sample is there for the picture of the documentation."""
     with stage(tmp_path, sample=PICTURES is not None, serve=("--device", "cpu")) as (server, captures):
@@ -167,7 +165,6 @@ def assert_turns(page) -> None:
     page.locator("canvas[data-turns=true]").wait_for()
 
 
-@pytest.mark.long
 def test_a_fault_is_named_and_mended(browser, tmp_path):
     with stage(tmp_path, "--faults", DEAD) as (server, captures), opened(browser, server, bypass_csp=True) as page:
         page.get_by_label("Capture", exact=True).fill("ball")
@@ -201,7 +198,6 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         assert [line["shot"] for line in lines if line.get("was_taken")] == ["0005_light_003", "0006_light_004"]
 
 
-@pytest.mark.long
 def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(browser, tmp_path):
     with stage(tmp_path) as (server, captures), opened(browser, server) as page:
         page.get_by_label("Capture", exact=True).fill("ball")
@@ -229,7 +225,6 @@ def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(br
         assert not list((captures / "ball-ball").glob("*.png"))
 
 
-@pytest.mark.long
 def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tmp_path):
     """A watched folder sets no exposure times, which its sentence says, and so the plan is judged."""
     with stage(tmp_path) as (server, captures), opened(browser, server, bypass_csp=True) as page:
@@ -273,7 +268,6 @@ def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tm
         expect(times).to_have_value("")
 
 
-@pytest.mark.long
 def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
     """A camera that sees the window of the projector pixel by pixel."""
     size, watched, released = (64, 48), tmp_path / "watched", tmp_path / "released"
@@ -304,7 +298,6 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
         expect(page.locator("#now")).to_contain_text("The patterns are decoded.")
 
 
-@pytest.mark.long
 def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_path):
     """The camera that Aravis feigns shows a ramp that moves, whatever lamps shine."""
     if find_library(LIBRARY) is None:
@@ -323,7 +316,6 @@ def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_pat
         assert settings["DeviceVendorName"] == "Aravis"
 
 
-@pytest.mark.long
 def test_the_live_view_says_what_clips_and_ends_before_a_capture(browser, tmp_path):
     frame = np.full((48, 64, 3), 90, np.uint8)
     frame[:, 32:] = 255

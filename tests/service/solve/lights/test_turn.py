@@ -52,9 +52,7 @@ def test_lights_that_are_declared_right_raise_no_doubt(tmp_path, name):
     assert "light_turn" not in report["found"] and not any("frames[]" in sentence for sentence in report["warnings"])
 
 
-@first_short(("name", "how"), [
-    *((name, "tilted") for name in QUICK), ("perspective", "about the view axis"),
-    ("glossy", "tilted")])
+@first_short(("name", "how"), [*((name, "tilted") for name in QUICK), ("perspective", "about the view axis"), ("glossy", "tilted")])
 def test_lights_that_are_turned_are_named_and_sigma_holds_it(tmp_path, name, how):
     """Without it normals were wrong by the turn, beyond ten σ of matt ones, without a word."""
     error, sigma, report = solved(tmp_path, name, TURNS[how])

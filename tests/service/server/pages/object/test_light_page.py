@@ -13,6 +13,7 @@ from tests.scenes.captures import edit_manifest, write_exr
 from tests.service.server.pages.conftest import SAMPLES, Solved, done, expect, new_context, seen
 from tests.service.server.pages.frames import assert_same, encoded, picture, rendered
 
+pytestmark = pytest.mark.long
 CAPTURED = 7
 """A light of the sample, from whose direction its photograph is compared."""
 
@@ -31,14 +32,12 @@ def prepared_view(client, capture: str) -> dict:
     return client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
 
 
-@pytest.mark.long
 def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     opened.get_by_label("Size of the light in degrees").fill("10")
     shown = picture(opened)
     assert_same(shown, *rendered(opened, solved, tmp_path))
 
 
-@pytest.mark.long
 def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(opened):
     box = opened.locator("canvas.picture").bounding_box()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -57,7 +56,6 @@ def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(ope
     opened.locator("canvas.picture:not(.hatched)").wait_for()
 
 
-@pytest.mark.long
 def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solved):
     """The error is the one that was measured when the basis was made; the rate appears when something moves."""
     with solved.server.client() as client:
@@ -75,7 +73,6 @@ def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solve
     opened.locator("[data-shows=speed]", has_text="pictures a second").wait_for(timeout=60_000)
 
 
-@pytest.mark.long
 def test_nothing_is_drawn_while_nothing_changes(page, solved):
     page.add_init_script("""const draw = WebGL2RenderingContext.prototype.drawArrays;
       globalThis.drawn = 0;
@@ -94,7 +91,6 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
     seen(page, lambda: page.evaluate(frames) == page.evaluate(frames), "it is drawn again and again")
 
 
-@pytest.mark.long
 def test_arrow_keys_move_the_light(page, solved):
     """Also while the first picture stands for one that is still loaded."""
     held, holds = [], [True]
@@ -115,7 +111,6 @@ def test_arrow_keys_move_the_light(page, solved):
     assert np.degrees(np.arccos(np.dot(before, after))) == pytest.approx(5, abs=1.5) and after[0] > before[0]
 
 
-@pytest.mark.long
 def test_a_photograph_is_compared(opened, solved, tmp_path):
     """At the left end of the wipe, all of the picture is the photograph, as its coefficient images keep it."""
     opened.get_by_label("Photograph to compare with").select_option(str(CAPTURED))
@@ -131,7 +126,6 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
     assert_same(shown, encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
 
-@pytest.mark.long
 def test_without_webgl_it_is_said(browser, solved):
     context = new_context(browser, base_url=solved.server.url)
     context.add_init_script("HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, "
@@ -143,7 +137,6 @@ def test_without_webgl_it_is_said(browser, solved):
     context.close()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("turn", ["0", "130"])
 def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path, turn):
     page.goto(solved.pages["light"])
@@ -183,7 +176,6 @@ def wide_skies(server, tmp_path_factory) -> dict[str, str]:
                 for capture, header in declared.items()}
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("capture", ["solved", "aces"])
 def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_skies, tmp_path, request):
     """A key light is chosen in the colours of the screen, and maps and captures have colour spaces of their own."""
@@ -199,7 +191,6 @@ def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sk
     assert_same(shown, *rendered(page, shown_capture, tmp_path))
 
 
-@pytest.mark.long
 def test_a_file_that_is_no_environment_or_of_an_unknown_colour_space_is_named(opened, tmp_path):
     broken, odd = tmp_path / "broken.exr", tmp_path / "odd.exr"
     broken.write_bytes(b"nothing")
@@ -209,7 +200,6 @@ def test_a_file_that_is_no_environment_or_of_an_unknown_colour_space_is_named(op
         opened.get_by_role("alert").get_by_text(f"{path.name}: {words}").wait_for(timeout=60_000)
 
 
-@pytest.mark.long
 def test_an_environment_that_comes_after_another_was_chosen_lights_nothing(opened, sky):
     """The test reads the environment once more when the page has got it: by then the page has read it too."""
     held, path = [], f"/v1/environments/{sky}/file"
@@ -227,7 +217,6 @@ def test_an_environment_that_comes_after_another_was_chosen_lights_nothing(opene
     assert opened.evaluate("relit.state().environment") is None and opened.evaluate("relit.state().light") is not None
 
 
-@pytest.mark.long
 def test_a_local_environment_is_shown_spins_and_is_not_sent(opened):
     opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
     opened.locator("canvas.preview").wait_for(timeout=60_000)
