@@ -133,7 +133,8 @@ def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
     assert found == dict.fromkeys(lamps, FaultKind.UNLIT) and at_once >= set(lamps[12:])
 
 
-@first_short("gain", [1.0, 0.004])
+@pytest.mark.long
+@pytest.mark.parametrize("gain", [1.0, 0.004])
 def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
     """As float images have them whose full scale is any number."""
     scene, random = relief(1), np.random.default_rng(1)

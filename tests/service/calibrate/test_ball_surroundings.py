@@ -73,6 +73,7 @@ def test_the_same_lamp_in_every_frame_is_refused(tmp_path):
     assert (folder / "capture.json").read_text() == before
 
 
+@pytest.mark.long
 def test_two_lamps_alike_are_as_unsure_as_they_differ(tmp_path):
     """The second frame shows the first lamp too, .9 as bright, and the third a half as bright in its peak: that is no rival."""
     images = [image((lamp(d),)) for d in DIRECTIONS]

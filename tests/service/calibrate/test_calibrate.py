@@ -173,6 +173,7 @@ def test_light_of_the_room_is_told_by_the_dark_side_of_a_ball(relit, tmp_path, r
     assert "the dark side" not in relit.done("calibrate", "grey-ball", folder, "--ball", CIRCLE, *refined).out
 
 
+@pytest.mark.long
 def test_a_ball_behind_an_analyser_shows_half_of_the_irradiance(relit, tmp_path):
     """Of a crossed and of a parallel one alike, because a matt ball keeps no polarisation; each frame keeps what it says of it."""
     lights = [{**PLACEHOLDER, "direction": direction.tolist(), "polarization": kind} for direction in DIRECTIONS

@@ -283,7 +283,8 @@ def test_lamps_of_several_primaries_have_a_matrix_each_and_a_narrow_one_is_refus
     assert (folder / "capture.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("gap", [0.79, pytest.param(0.94, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("gap", [0.79, 0.94])
 def test_charts_with_other_gaps_are_found(gap, tmp_path):
     shown = picture(seen(), POSE, patch=47 * gap)
     found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))

@@ -81,6 +81,7 @@ def test_phase_with_noise_is_as_sure_as_it_says(relit, tmp_path):
     assert 0.8 < np.sqrt(np.mean(np.clip(ratio, -5, 5) ** 2)) < 1.2
 
 
+@pytest.mark.long
 def test_both_axes_of_two_periods(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *phase_patterns("column", 144), *phase_patterns("row", 16),
                                      *phase_patterns("row", 144), {"code": "black"}])

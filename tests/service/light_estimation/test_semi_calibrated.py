@@ -245,6 +245,7 @@ def test_a_mirror_is_not_explained_by_its_lights():
     assert explain(given._replace(radiance=(shine[..., None] * given.irradiance[:, None, :]))) is None
 
 
+@pytest.mark.long
 def test_false_directions_are_seen_beside_a_background_that_few_lights_reach():
     """As in JPEG files, where a dark background reads 0 under most lights and a code or two under some."""
     count = 80

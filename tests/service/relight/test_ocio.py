@@ -16,6 +16,7 @@ from stage.colour.colour_spaces import linear_space
 from stage.colour.configuration import used
 from stage.colour.location import STUDIO, VARIABLE
 from stage.formats import exr
+from tests.marks import first_short
 from tests.reference.colour import ACES_TO_ACESCG, ACES_TO_REC709, AWG4_TO_ACES, logc4_to_linear
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, rgb, write_capture, write_image
 from tests.service.captures.test_check_process import Told
@@ -59,7 +60,7 @@ def test_logc4_in_and_acescg_out(relit, logged, tmp_path):
     assert "ARRI LogC4, worked on in ocio:lin_awg4_scene" in shown and f"{label}, cache id {cache_id}" in shown
 
 
-@pytest.mark.parametrize(("place", "space"), [
+@first_short(("place", "space"), [
     (STUDIO, "ARRI LogC4"), (STUDIO, "S-Log3 S-Gamut3.Cine"), ("ocio://cg-config-latest", "ACEScct"), ("minimal", "house gamma")])
 def test_frames_are_what_openimageio_makes_of_the_images(relit, logged, tmp_path, place, space):
     """In one piece from the codes to ACEScg, by each configuration; and solved without the halves of files, within 1e-5 of the value.

@@ -80,6 +80,7 @@ def test_parts_guided_by_maps(compare, tmp_path):
     assert len(whole) == 4 and parts == whole
 
 
+@pytest.mark.long
 def test_parts_of_a_sequence_of_captures_and_maps(compare, tmp_path):
     for step in (1, 2, 3):
         write_capture(tmp_path / "seq" / f"t{step}", SCENE._replace(images=SCENE.images * step), name=f"t{step}")

@@ -69,6 +69,7 @@ def test_one_capture_is_open_at_a_time(relit, sequence, tmp_path, monkeypatch):
     assert written[0] == 0 and len(written) == 3 and written[2] >= 1
 
 
+@pytest.mark.long
 def test_layers_come_from_a_folder_of_maps_a_capture(relit, sequence, tmp_path):
     for step in ("t01", "t02", "t10"):
         assert relit("solve", sequence / step, "--method", "lambert", "--out", tmp_path / "maps" / step).code == 0

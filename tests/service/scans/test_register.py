@@ -117,6 +117,7 @@ def test_poses_of_the_file_are_starts(relit, tmp_path):
     np.testing.assert_allclose(found.scans[0].scan_to_world, seen[0].world_from_scan, atol=1e-12)  # the reference stays where it is
 
 
+@pytest.mark.long
 def test_starts_decide_where_the_surface_does_not(relit, tmp_path):
     """About its axis a vase stays at its start, half a degree off, and σ says that; elsewhere its surface places it.
 

@@ -163,6 +163,7 @@ def test_the_model_is_the_material_of_the_maps_under_the_lights(shown_samples):
     np.testing.assert_allclose(found.samples("model")[agree], found.samples("measured")[agree], rtol=6 * HALF_ROUNDING, atol=2e-5)
 
 
+@pytest.mark.long
 def test_near_lights_are_where_they_are(tmp_path):
     """Each pixel has a direction and a distance of its own. Tolerance: half values, and heights in float32."""
     scene = near_lights.dome(24)

@@ -101,6 +101,7 @@ def test_an_environment_through_the_table_is_that_of_relight(folder, full, sky):
     assert frame.sum() == pytest.approx(wanted.sum(), rel=0.02)
 
 
+@pytest.mark.long
 def test_the_energy_of_every_direction_is_kept(tmp_path):
     """White surfaces that face every light alike: whatever the direction, the weights of the lights add up to one."""
     directions = sphere_directions(20)

@@ -186,6 +186,7 @@ def test_a_rough_lobe_seen_in_perspective(device):
     assert np.allclose(found.f0.numpy()[:, :20], 0.3, rtol=0.01) and np.allclose(found.roughness.numpy()[:20], 0.4, atol=0.01)
 
 
+@pytest.mark.long
 def test_colour_tells_them_apart_on_a_dielectric(device):
     """Without separation the highlight tilts the normal towards the mirror direction; the chromatic part does not know it."""
     normal = cap(40, 60)

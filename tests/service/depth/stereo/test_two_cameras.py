@@ -82,6 +82,7 @@ def test_depth_is_that_of_the_cameras(relit, tmp_path, noise, most):
     assert "two cameras" in report["method"] and "decoded_only" not in report["found"]
 
 
+@pytest.mark.long
 def test_what_the_second_camera_does_not_see_has_no_depth(relit, tmp_path):
     """The sphere hides a part of the plane from the second camera; no other part is taken for it."""
     first = two_captures(tmp_path)

@@ -116,6 +116,7 @@ def test_three_phases_and_images_in_other_units(tmp_path):
     assert maps.mask.mean() > 0.98 and np.median(np.abs(error)) < 5e-3
 
 
+@pytest.mark.long
 def test_filters_run_when_they_are_named(tmp_path):
     settings = tof.even(tof.HZ, 4)
     fine = tof.room(4 * ROWS, 4 * COLS)

@@ -140,6 +140,7 @@ def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness
     assert stored(idle_harness, identifier) == (names,) * 2
 
 
+@pytest.mark.long
 @ON_SQLITE
 def test_an_import_that_fails_in_any_way_takes_what_it_made_away(idle_harness, uploaded, monkeypatch):
     identifier, names = uploaded

@@ -34,6 +34,7 @@ def metal_cap(folder, lights=24):
     return captures.write_capture(folder, scene._replace(directions=directions, irradiance=np.ones((lights, 3)), images=images)), scene
 
 
+@pytest.mark.long
 def test_metal_by_robust_is_unsure_has_no_spikes_and_says_so(tmp_path):
     folder, scene = metal_cap(tmp_path / "capture")
     result = solve(SolveRequest(capture=folder, out=tmp_path / "out", method=Method.ROBUST, device="cpu"))
