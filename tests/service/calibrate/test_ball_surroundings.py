@@ -57,7 +57,7 @@ def measured(folder, circles=NAMED):
 
 
 @first_short("room", [lamp(WINDOW, 12.0, 0.6), lamp(WINDOW, 12.0, 5.0), lamp(WINDOW, 3.0, 5.0)],
-                         ids=["window", "saturated window", "lamp of the room"])
+             ids=["window", "saturated window", "lamp of the room"])
 def test_a_light_of_the_room_is_not_the_lamp(tmp_path, room):
     """A light of the room is brighter or larger than the lamp, and stands still from frame to frame; a pixel is 2° of reflection."""
     errors, _, flags = measured(write(tmp_path / "ball", [image((lamp(d, radiance=3.0), room)) for d in DIRECTIONS]))

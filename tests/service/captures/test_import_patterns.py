@@ -79,7 +79,7 @@ COLUMN_M = 0.065
 
 
 @first_short("layout", ["references first, no inverses", "inverses first", "inverses in blocks, fine first", "fewer bits",
-                                    "OpenCV's, as a scanner"])
+                        "OpenCV's, as a scanner"])
 def test_gray_codes(relit, tmp_path, layout):
     calibration = write_calibration(tmp_path / "rig.yml", OPENCV)
     rig = ("--calibration", calibration, "--unit-m", "0.001", "--projector", SIZE)

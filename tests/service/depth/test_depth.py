@@ -220,7 +220,7 @@ def test_saturated_readings_are_refused(relit, tmp_path):
 
 
 @first_short("patterns", [[*phase_patterns("column", 16), *gray_patterns("column", stripe=4)],
-                                      [*gray_patterns("column", stripe=4), *gray_patterns("row", stripe=4)]])
+                          [*gray_patterns("column", stripe=4), *gray_patterns("row", stripe=4)]])
 def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], noise=0.01)
     whole, _ = solve(relit, tmp_path)

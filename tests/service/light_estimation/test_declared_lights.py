@@ -42,7 +42,7 @@ def test_axes_along_which_nothing_faces_the_camera_are_named(tmp_path, axis):
 
 
 @first_short(("signs", "words"), [([1, -1, 1], "the axes look mirrored: with y negated"),
-                                              ([-1, -1, 1], "along the outline the normals point inwards"), ([1, 1, 1], None)])
+                                  ([-1, -1, 1], "along the outline the normals point inwards"), ([1, 1, 1], None)])
 def test_axes_under_which_the_normals_are_of_no_surface_that_stands_free_are_named(tmp_path, signs, words):
     """Lights with y down, or turned by 180°, explain every reading of a matt object as well as the right ones."""
     for said in declared(tmp_path / "capture", lambda directions: directions * signs, ellipsoid(count=12)):

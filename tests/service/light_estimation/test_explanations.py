@@ -74,7 +74,7 @@ def test_an_exposure_that_changes_is_named_with_its_image(first, factor, gloss):
 
 
 @first_short("change", [np.ones(24), np.exp(0.2 * np.random.default_rng(4).normal(size=24)), np.linspace(0.7, 1.3, 24),
-                                    np.where(np.arange(24) == 20, 0.4, 1.0)])
+                        np.where(np.arange(24) == 20, 0.4, 1.0)])
 def test_lights_that_differ_are_no_step(change):
     """Equal lights, single ones, lamps that fade, and one that is dim."""
     readings, lights = ball(0.1)

@@ -175,8 +175,7 @@ def test_of_lights_in_one_place_the_first_has_the_cell(device):
     assert (np.delete(cells.energy[0], np.s_[::3], axis=0) == 0).all()
 
 
-@first_short("direction", [cap(31, 180), AXES, ring(40, 0), scattered(100, 5), AXES[:1]],
-             ids=["31", "axes", "lunes", "100", "one"])
+@first_short("direction", [cap(31, 180), AXES, ring(40, 0), scattered(100, 5), AXES[:1]], ids=["31", "axes", "lunes", "100", "one"])
 def test_nearest_light_by_brute_force(direction, device):
     whole = cut(37, 75)
     grid = whole._replace(**{name: getattr(whole, name)[3::7] for name in ("polar", "solid_angle", "texel_row")})

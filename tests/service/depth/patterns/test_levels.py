@@ -45,7 +45,7 @@ def test_frames_that_mix_two_patterns_are_named(tmp_path, scene, patterns, part)
 
 
 @first_short(("patterns", "gamma"), [(NUMBERED, 1.0), (SEVERAL, 1.0), (NUMBERED, 1.8)],
-                         ids=["numbered", "several", "a camera that is not linear"])
+             ids=["numbered", "several", "a camera that is not linear"])
 def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
     result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)
     assert not mixed(result)

@@ -43,16 +43,16 @@ def measured(folder, scene, patterns, *, dark=(), again=(), copies=None, columns
 
 
 @first_short(("patterns", "number"), [(NUMBERED, 1), (NUMBERED, 7), (INVERSES, 8), (INVERSES, 3), (PLAIN, 5), (WAVES, 4),
-                                                   (KARY, 5)],
-                         ids=["wave", "bit", "bit with inverse", "inverse", "bit without inverse", "one of several waves", "digit"])
+                                       (KARY, 5)],
+             ids=["wave", "bit", "bit with inverse", "inverse", "bit without inverse", "one of several waves", "digit"])
 def test_a_dark_frame_is_named(tmp_path, scene, patterns, number):
     said, solved = measured(tmp_path, scene, patterns, dark=[number])
     assert f"{number:02d}.exr shows no stripes" in said[0] and not solved.any()
 
 
 @first_short(("patterns", "number"), [(NUMBERED, 2), (NUMBERED, 10), (INVERSES, 7), (BINARY, 6), (PLAIN, 5), (WAVES, 3),
-                                                   (KARY, 5)],
-                         ids=["wave", "bit", "inverse", "bit of a binary code", "bit without inverse", "next wave", "digit"])
+                                       (KARY, 5)],
+             ids=["wave", "bit", "inverse", "bit of a binary code", "bit without inverse", "next wave", "digit"])
 def test_a_frame_that_shows_the_pattern_before_is_named(tmp_path, scene, patterns, number):
     said, solved = measured(tmp_path, scene, patterns, again=[number])
     assert f"{number:02d}.exr and {number - 1:02d}.exr show the same" in said[0] and not solved.any()
@@ -68,7 +68,7 @@ def test_copies_of_earlier_frames_are_named(tmp_path, scene, patterns, copies):
 
 
 @first_short("patterns", [INVERSES, PLAIN, BINARY, XOR, WAVES, KARY, NUMBERED],
-                         ids=["inverses", "without inverses", "binary", "XOR", "waves", "digits", "numbered"])
+             ids=["inverses", "without inverses", "binary", "XOR", "waves", "digits", "numbered"])
 def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
     said, solved = measured(tmp_path, scene, patterns, columns=slice(30, 50), noise=0)
     assert not said and solved.any()
@@ -76,8 +76,8 @@ def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
 
 @first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
 @first_short("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
-                         ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
-                              "one wave"])
+             ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
+                  "one wave"])
 def test_bits_that_narrow_things_do_not_show_are_not_missed(tmp_path, scene, patterns, columns):
     said, solved = measured(tmp_path, scene, patterns, columns=columns)
     assert not said and solved.any()

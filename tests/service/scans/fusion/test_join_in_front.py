@@ -13,6 +13,7 @@ from tests.scenes.register import fuse_scans
 from tests.scenes.statue import Shot, write_scans
 from tests.service.scans.mesh_files import read_faces
 
+pytestmark = pytest.mark.long
 DEPTH_SIGMA, NORMAL_DEGREES, DRIFT_DEGREES = 5e-4, 0.5, 2.0
 VOXEL = 2e-3
 RESOLVED = 1.0
@@ -42,7 +43,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("name", "sigma"), NOISE)
 def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     scene = SCENES[name]
@@ -74,14 +74,12 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     assert not [warning for warning in joined.warnings if warning.startswith("normals:")]
 
 
-@pytest.mark.long
 def test_normals_of_another_surface_are_refused(tmp_path):
     with pytest.raises(RequestError, match=r"scan-set\.json: the photometric normals contradict the depth"):
         both(tmp_path, *disc(np.s_[:]))
     assert not (tmp_path / "joined").exists()
 
 
-@pytest.mark.long
 def test_normals_that_contradict_a_third_of_the_depth_are_told(tmp_path):
     """Normals are flipped in the left part of every view: what they show stays as its depth has it."""
     scene = SCENES["disc"]

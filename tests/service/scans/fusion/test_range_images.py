@@ -14,6 +14,7 @@ from stage.sets.scan_set import read_scan_set
 from tests.scenes.register import fuse_scans
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
+pytestmark = pytest.mark.long
 STATUS = Path("/proc/self/status")
 SHAPE = 256, 320
 """As large that the arrays, some 50 bytes a pixel, are far more than what the kernel counts late."""
@@ -24,7 +25,6 @@ def mapped_mib() -> float:
     return next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if line.startswith("RssFile")) / 1024
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not STATUS.exists(), reason="memory is told by /proc")
 def test_what_is_released_leaves_memory_and_can_be_read_again(tmp_path):
     file, listed = read_scan_set(write_scans(tmp_path / "scans", turntable(2, SHAPE[::-1])))
@@ -55,7 +55,6 @@ def both(tmp_path_factory) -> list[FuseResult]:
     return found
 
 
-@pytest.mark.long
 def test_the_surface_is_better(both):
     squares, pixels = (read_ply_points(found.mesh_path).points for found in both)
     assert [{scan["square_px"] for scan in found.facts["scans"]} for found in both] == [{3}, {1}]
@@ -66,7 +65,6 @@ def test_the_surface_is_better(both):
     assert both[0].facts["scans"][0]["pixels"] < 0.15 * both[1].facts["scans"][0]["pixels"]
 
 
-@pytest.mark.long
 def test_colours_are_means_of_squares(both):
     ply = read_ply_points(both[0].mesh_path)
     assert ply.colours is not None

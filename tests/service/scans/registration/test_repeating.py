@@ -9,6 +9,7 @@ from service.scans.registration.registration import NoneJoinedError
 from tests.scenes.register import register, scan_with
 from tests.scenes.turntable import MM
 
+pytestmark = pytest.mark.long
 PERIOD, SIGMA = 5 * MM, 0.03 * MM
 
 
@@ -40,14 +41,12 @@ def registered(height, start_m: float, *, starts_decide: bool = False):
     return register([plate(height, -0.08, 1), plate(height, -0.04, 2)], [np.eye(4), start], starts_decide=starts_decide)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("start_m", [2.4 * MM, 2.6 * MM])
 def test_a_start_between_two_periods_is_refused(start_m):
     with pytest.raises(NoneJoinedError, match=r"a pose .* mm beside fits as well, and is as near its start: the surface repeats itself"):
         registered(pattern, start_m)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("height", "start_m"), [(pattern, 0.3 * MM), (pattern, 1.5 * MM), (uneven, 1.5 * MM), (uneven, 2.4 * MM)])
 def test_right_starts_and_plates_that_do_not_repeat_are_joined(height, start_m):
     found = registered(height, start_m)
@@ -56,7 +55,6 @@ def test_right_starts_and_plates_that_do_not_repeat_are_joined(height, start_m):
     assert not found.pairs[0].reason
 
 
-@pytest.mark.long
 def test_a_start_that_decides_has_a_sigma_that_reaches_the_other_period():
     found = registered(pattern, 2.6 * MM, starts_decide=True)
     assert "the start is taken" in found.pairs[0].reason

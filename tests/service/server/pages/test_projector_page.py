@@ -20,6 +20,7 @@ from tests.scenes.patched_rigs import write_plan
 from tests.service.server.pages.conftest import new_context
 from tests.service.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
 RELEASED = "released"
 EXPOSURE = 0.8
 """White does not clip."""
@@ -73,7 +74,6 @@ def request_of(tmp_path: Path, watched: Path, size: tuple[int, int], *sequences:
                           out=tmp_path / "capture", projector=size, projector_port=0, color_space="lin_rec709_scene", timeout=PATIENCE_S)
 
 
-@pytest.mark.long
 def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_path, watched):
     size = 520, 513  # ten bits each
     plan = {"take": "patterns", "code": "gray", "axis": "both"}, {"take": "patterns", "code": "phase"}
@@ -92,7 +92,6 @@ def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_pa
     assert np.abs(v - rows)[mask].max() <= 1e-3  # stripes of one pixel
 
 
-@pytest.mark.long
 def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp_path, watched):
     """Two pixels of the screen for each of the page's, which is full screen; stripes of one pixel are exact."""
     size = 160, 96
@@ -107,7 +106,6 @@ def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp
         assert np.array_equal(seen > EXPOSURE / 2, draw(frame.pattern, size) > 0.5), frame.pattern
 
 
-@pytest.mark.long
 def test_a_window_of_another_size_is_refused(browser, tmp_path, watched):
     request = request_of(tmp_path, watched, (640, 480), {"take": "patterns", "code": "ramp"})
     page = new_context(browser, viewport={"width": 600, "height": 400}).new_page()
