@@ -14,7 +14,7 @@ from stage.capture.manifest import Frame
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Code, Collected
 from stage.patterns.kary import KaryCode
-from stage.patterns.phase import PhaseCode
+from stage.patterns.phase import FULL_STEPS, PhaseCode
 
 DARK, BRIGHT, OTHERS = 0.25, 0.75, 0.05
 """Parts of the difference of a pixel's brightest and darkest reading below and above which a stripe is dark and bright, and the least share
@@ -25,7 +25,8 @@ COARSER = 2
 """Coarser bits or digits with stripes, between whose edges there are some of the finer one."""
 ALIKE, OTHER_WAVES = 1.5, 2
 """Largest ratio of the periods of waves that are alike, and the least number of such frames that show stripes: where a scene is so narrow
-that a wave may be dark all over it, its opposite is bright all over it."""
+that a wave may be dark all over it, its opposite is bright all over it. Three steps have no opposite, and are judged beside other waves, or
+under stripes that number them: a third of a turn is dark in one and has stripes in both others."""
 OPPOSITE = 0.9
 """Least share of the pixels that are dark in a frame and bright in its inverse, or the reverse, where both show their patterns."""
 SAME_PART, SAME_SIGMAS = 0.1, 5.0
@@ -43,7 +44,9 @@ def check_frames(sample: Sample, collected: Collected, frames: Sequence[Frame], 
     level = (grey - grey.min(axis=0)) / whole
     dark, bright = (level < DARK).mean(axis=1), (level > BRIGHT).mean(axis=1)
     stripes, even = np.minimum(dark, bright) >= OTHERS, np.maximum(dark, bright) >= EVEN
-    missed = sorted(row for code in collected.codes for row in _without_stripes(code, stripes, even))
+    alone = [code for code in collected.codes if isinstance(code, PhaseCode) and len(code.frames) == FULL_STEPS
+             and all(other is code or other.axis != code.axis for other in collected.codes)]
+    missed = sorted(row for code in collected.codes if code not in alone for row in _without_stripes(code, stripes, even))
     if missed:
         names, shows = ", ".join(frames[row].image for row in missed), "shows" if len(missed) == 1 else "show"
         return f"frames: {names} {shows} no stripes, and others do: the projector has missed the pattern; take the sequence again"

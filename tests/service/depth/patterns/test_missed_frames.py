@@ -74,10 +74,11 @@ def test_rendered_frames_without_noise_are_no_copies(tmp_path, scene, patterns):
     assert not said and solved.any()
 
 
-@first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(60, 75), slice(30, 75)], ids=str)
-@first_short("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0)],
+@first_short("columns", [None, slice(10, 16), slice(40, 50), slice(44, 56), slice(55, 85), slice(60, 75), slice(30, 75)], ids=str)
+@first_short("patterns", [NUMBERED, INVERSES, PLAIN, BINARY, BINARY_PLAIN, XOR, WAVES, KARY, phase_patterns("column", 128.0),
+                          phase_patterns("column", 128.0, 3)],
              ids=["numbered", "inverses", "without inverses", "binary", "binary without inverses", "XOR", "waves", "digits",
-                  "one wave"])
+                  "one wave", "one wave of three steps"])
 def test_bits_that_narrow_things_do_not_show_are_not_missed(tmp_path, scene, patterns, columns):
     said, solved = measured(tmp_path, scene, patterns, columns=columns)
     assert not said and solved.any()
