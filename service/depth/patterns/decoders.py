@@ -32,6 +32,10 @@ from stage.patterns.modulated import ModulatedCode
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.patterns.ramp import RampCode
 
+CHANGED_RAD = 8**0.5
+"""RMS error of a phase over the part of white by which the mean of its wave has moved: one of N frames that is brighter by x moves the mean
+by x/N, and the phase by 4x/N sin φ."""
+
 
 class PatternProjector(NamedTuple):
     """The properties of a projector that decoding needs; its lens and pose are needed by triangulation alone."""
@@ -43,6 +47,8 @@ class PatternProjector(NamedTuple):
     """The exponent γ of light = level^γ that the waves show though no response is given: their error is added to the deviation."""
     left_rad: float | None = None
     """The error of a phase that is left when waves are bent back by the exponent; None: they are not bent back."""
+    changed: float = 0.0
+    """The part of white by which light that has changed between the frames moves the mean of waves: its error is added to the deviation."""
     edge_error_px: float = EDGE_ERROR
     """The error in camera pixels of an edge of stripes, as of `measured_edge_error`."""
     unseen_digits: tuple[int, int] = (0, 0)
@@ -69,9 +75,9 @@ class PatternProjector(NamedTuple):
         return self.response
 
     def wave_error(self, shifts: Sequence[float], period_px: float) -> float:
-        """Return the RMS error in radians of a phase that is fitted to waves of the exponent as if they were linear."""
+        """Return the RMS error in radians of a phase that is fitted to waves of the exponent, or in changed light, as if to others."""
         if self.response is not None or self.exponent == 1.0:
-            return 0.0
+            return CHANGED_RAD * self.changed
         if self.left_rad is not None:
             return self.left_rad
         own = np.array(shifts)

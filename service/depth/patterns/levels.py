@@ -39,6 +39,11 @@ BETWEEN, SEVERAL = (0.25, 0.75), 2
 its coarse bits, white and black: at the edge of a stripe of a Gray code one bit is between the two, and no other."""
 COARSE = 0.5
 """Part of the bits, the coarsest, that are looked at: blur and texture do not reach far into their stripes."""
+ALIKE = 0.3
+"""Scatter over the pixels of the change of a sum, as a part of it, up to which the light has changed: lamps that fade leave .1, light of
+the room that comes on .2, and mixed patterns 1 and more."""
+STEADY = "let the projector warm up, switch off its dynamic modes and the camera's automatic exposure, and keep other light out"
+"""What to do about light that changes between frames."""
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 MOVED_SIGMAS, MOVED_PART = 6.0, 0.04
@@ -167,6 +172,24 @@ def check_levels(sample: Sample, collected: Collected, projector: PatternProject
             "and their inverses, or waves over their shifts, do not add up to the same light): the camera has recorded parts of two "
             "patterns, or what it sees has moved: wait longer for each pattern, or synchronise projector and camera"
             f"{UNKNOWN_RESPONSE if unknown else ''}")
+
+
+def light_sentence(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
+    """Return a sentence if waves over their shifts differ alike at nearly all pixels, as under light that has changed between them; None if
+    they do not. Mixed patterns and motion differ to both sides."""
+    grey = sample.grey
+    lit = sample.lit(grey, noise)
+    waves = EvenLevels.of(collected, len(grey), projector.response).waves
+    if waves is None or lit.sum() < ENOUGH:
+        return None
+    sums = waves.astype(np.float32) @ grey[:, lit]
+    part = sums / sums.mean(axis=0)
+    usual = np.median(part, axis=1)
+    change = float(np.ptp(usual))
+    if change < LEAST_PART or np.median(np.abs(part - usual[:, None]), axis=1).max() > ALIKE * change:
+        return None
+    return (f"frames[]: waves over their shifts differ by {100 * change:.0f} % nearly everywhere alike: the lamp or the room's light has "
+            f"changed between the frames: {STEADY}; of that the standard deviations hold what several periods disagree by")
 
 
 class EvenSums(NamedTuple):

@@ -20,7 +20,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.lag import widen_lagging
-from service.depth.patterns.levels import check_levels, moved_pixels
+from service.depth.patterns.levels import check_levels, light_sentence, moved_pixels
 from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_noise
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
@@ -55,6 +55,8 @@ class PatternCodes(NamedTuple):
     rows: AxisDecoder | None
     unused: tuple[str, ...]
     """Codes that no decoder reads."""
+    steady: bool = True
+    """False if the light has changed between the frames: waves that contradict each other tell nothing of light below surfaces then."""
 
     @property
     def method(self) -> str:
@@ -194,21 +196,25 @@ def checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projec
         check_unevenness(sample, patterns, shown, noise, device) if projector is None
         else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_frames(sample, codes.collected, frames, noise)
-    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, measured)
+    changed = light_sentence(sample, codes.collected, shown, measured)
+    wrong = wrong or check_codes(sample, codes.collected, shown, noise)
+    wrong = wrong or (None if changed is not None else check_levels(sample, codes.collected, shown, measured))
     wrong = wrong or check_ramps(sample, codes.collected, shown, measured)
     waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
     wrong = wrong or waves.wrong
     if wrong is not None:
         return Checks([wrong], codes, False)
-    bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or shown._replace(
-        exponent=find_exponent(sample, codes.collected, shown, noise, device))
-    said = [] if waves.unconfirmed is None else [waves.unconfirmed]
+    bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or find_exponent(
+        sample, codes.collected, shown, noise, device)
+    said = [sentence for sentence in (waves.unconfirmed, changed) if sentence is not None]
     names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
     if projector is not None and projector.principal_px is None and len(names) == 1:
         said.append("projector.principal_px: is missing, and the middle of its image is taken, which patterns of one axis cannot confirm: "
                     "give it (relit calibrate procam measures it)")
-    if bent.exponent != shown.exponent:
-        codes, said = read_codes(capture, frames, bent, refine=refine), [response_sentence(bent, names), *said]
+    if bent != shown:
+        codes = read_codes(capture, frames, bent, refine=refine)
+        said = said if changed is not None and bent.changed else [response_sentence(bent, names), *said]
+    codes = codes._replace(steady=changed is None and not bent.changed)
     wrong = check_range(sample, codes.collected, bent, noise) or (
         None if projector is None else check_pose(sample, (codes.columns, codes.rows), projector_model(projector), noise, device))
     return Checks(said, codes, True) if wrong is None else Checks([wrong], codes, False)
@@ -308,7 +314,7 @@ def _widen(planes: Planes, coordinates: Coordinates, codes: PatternCodes, frames
     decoders = codes.columns, codes.rows
     lagging, wider = widen_lagging(planes, coordinates, decoders, codes.collected, noise)
     shifted, more = widen_shifted(planes, coordinates, decoders, codes.collected, frames)
-    return lagging + shifted, wider * more * widen_mixed(planes, coordinates, decoders, codes.collected, noise)
+    return (lagging if codes.steady else []) + shifted, wider * more * widen_mixed(planes, coordinates, decoders, codes.collected, noise)
 
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,

@@ -1,9 +1,9 @@
 """Whether light is linear in the levels that a projector shows: the exponent γ of light = level^γ that waves show, and ramps.
 
-Between black and white the mean of a wave is a half, and readings of five frames or more lie off a wave that is bent. Three or four leave
-too few over for that. But the second harmonic adds to the fitted amplitude in turn with three times the phase; the amplitude over the mean
-does not depend on albedo, and under an unbent wave not on the phase. What else changes it, ambient light and blur, changes slowly over the
-wave or not with it at all.
+Between black and white the mean of a wave is a half, unless it is bent, and has a second harmonic then, or the light has changed between
+frames. Readings of five frames or more lie off a wave that is bent. Three or four leave too few over for that. But the second harmonic adds
+to the fitted amplitude in turn with three times the phase; the amplitude over the mean does not depend on albedo, and under an unbent wave
+not on the phase. What else changes it, ambient light and blur, changes slowly over the wave or not with it at all.
 
 A rising ramp and the falling one are white and black together, at every place. Where the projector's response or the images bend light, the
 sum is least right half way between the borders; where the light has changed, it is wrong there as at the borders.
@@ -21,6 +21,7 @@ from kernels.structured.phase import weights
 from kernels.structured.response import bent_wave, fitted_curve, light_of
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.levels import STEADY
 from service.depth.patterns.pattern_checks import ENOUGH, LEAST_SIGNAL, Sample, decode_sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -50,24 +51,30 @@ RAMP_BINS, LEAST_RAMP_BINS = 20, 8
 MOST_BENT, MOST_CHANGED = 0.08, 0.12
 """Largest part of white minus black by which bent light makes the sum wrong half way, and changed light anywhere: lamps flicker by less,
 and images that were sharpened have 0.05."""
+LEAST_HARMONIC, BENT_PART = 0.03, 0.25
+"""Second harmonic, over the first, that the mean of waves must lead to expect for its absence to tell, and the part of it from which on
+they are bent: bent waves have .45 to 1.5 of it, less where blur hides it, and those under light that has changed .03 at most."""
 STEPS = 1024
 """Number of places at which a declared response is looked up."""
 
 
-def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> float:
-    """Return the exponent γ of light = level^γ that the waves of a capture show; 1.0 where they are as they should be."""
+def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> PatternProjector:
+    """Return the projector with the exponent γ of light = level^γ that the waves of a capture show, and with the light that changed; itself
+    where they are as they should be."""
     for code in collected.codes:
         if isinstance(code, PhaseCode):
-            found = _exponent_of_mean(sample, code, collected, noise)
+            found = _exponent_of_mean(sample, code, collected, projector, noise)
             if found is None:
-                found = _exponent_of_fit(sample, code, collected, projector, noise, device)
-            if found != 1.0:
+                found = projector._replace(exponent=_exponent_of_fit(sample, code, collected, projector, noise, device))
+            if found != projector:
                 return found
-    return 1.0
+    return projector
 
 
-def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noise: NoiseModel) -> float | None:
-    """Return the exponent from the mean of the waves between black and white; None without frames that tell them."""
+def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector,
+                      noise: NoiseModel) -> PatternProjector | None:
+    """Return the projector with the exponent from the mean of the waves between black and white, or with the light that changed where they
+    are not bent so; None without frames that tell them."""
     grey = sample.grey
     if collected.white is not None and collected.black is not None:
         dark, span = grey[collected.black], grey[collected.white] - grey[collected.black]
@@ -80,17 +87,39 @@ def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noi
     good = sample.whole & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
     if good.sum() < ENOUGH:
         return None
-    even = [list(wave.frames) for wave in code.waves
+    even = [wave for wave in code.waves
             if len(wave.frames) >= FULL_STEPS and abs(np.exp(2j * np.pi * np.array(wave.shifts)).sum()) < 1e-6]
     if not even:
         return None
-    means = [np.median((np.mean(grey[frames], axis=0)[good] - dark[good]) / span[good]) for frames in even]
-    mean = float(np.median(means))
+    grey, dark, span = grey[:, good], dark[good], span[good]
+    mean = float(np.median([np.median((np.mean(grey[list(wave.frames)], axis=0) - dark) / span) for wave in even]))
     if abs(mean - 0.5) <= MEAN_TOLERANCE:
-        return 1.0
+        return projector
     fine = np.linspace(0.3, 4.0, 371)
     table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
-    return float(np.interp(-mean, -np.array(table), fine))
+    exponent = float(np.interp(-mean, -np.array(table), fine))
+    bends = np.array([_second_harmonic(grey[list(wave.frames)], np.array(wave.shifts), wave.period_px, span, exponent) for wave in even])
+    seen, expected = np.median(bends, axis=0)
+    if abs(expected) > LEAST_HARMONIC and seen / expected < BENT_PART:
+        return projector._replace(changed=abs(mean - 0.5))
+    return projector._replace(exponent=exponent)
+
+
+def _second_harmonic(readings: np.ndarray, shifts: np.ndarray, period_px: float, span: np.ndarray,
+                     exponent: float) -> tuple[float, float]:
+    """Return the second harmonic of a wave, over the first, and that of this exponent under the blur that dims the first.
+    `readings`: [frames, pixels]. `shifts`: [frames] turns. `span`: [pixels], white less black."""
+    fit = weights(shifts, period_px).T @ readings
+    along = fit[1] + 1j * fit[2]
+    swing = np.abs(along)
+    harmonics = np.abs(np.fft.rfft(bent_wave(np.linspace(0, 1, 256)**exponent), norm="forward")[:3])
+    sharp = min(float(np.median(swing / span)) / (2 * harmonics[1]), 1.0)
+    three = len(shifts) == FULL_STEPS  # the second harmonic changes the swing then, in turn with three times the phase
+    part = swing / span / np.median(swing / span) if three else 2 / len(shifts) * (np.exp(4j * np.pi * shifts) @ readings) / swing
+    terms = np.stack([(along / swing) ** power for power in range(-3, 4)], axis=1)
+    fitted = np.linalg.lstsq(terms, part.astype(complex), rcond=None)[0]
+    seen = 2 * fitted[6].real if three else fitted[5].real
+    return seen, np.sign(exponent - 1) * harmonics[2] / harmonics[1] * sharp**3  # of a Gaussian: the second is dimmed as its fourth power
 
 
 def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
@@ -160,7 +189,11 @@ def _exponent_of_swing(grey: np.ndarray, shifts: Sequence[float], period_px: flo
 
 
 def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
-    """Return what is said of waves that a projector bends."""
+    """Return what is said of waves that a projector bends, or whose light has changed."""
+    if found.changed:
+        return (f"frames[]: waves lie {100 * found.changed:.0f} % of white off the middle between black and white and are not bent: the "
+                f"lamp or the room's light has changed between the frames: {STEADY}; the standard deviations of {' and '.join(codes)} "
+                "hold it")
     done = ("the error that this makes is" if found.left_rad is None else
             f"they were bent back by it, and the {found.left_rad:.2g} rad that this leaves are")
     return (f"projector.response: is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear: {done} "

@@ -13,7 +13,18 @@ from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns as waves
 from tests.marks import first_short
 from tests.scenes.captures import write_image, write_manifest
-from tests.scenes.depth import depth_of, depth_under, gray_patterns, grey_light, make_scene, manifest, phase_patterns, sample_of, shown
+from tests.scenes.depth import (
+    BLACK_WHITE,
+    depth_of,
+    depth_under,
+    gray_patterns,
+    grey_light,
+    make_scene,
+    manifest,
+    phase_patterns,
+    sample_of,
+    shown,
+)
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 SEVERAL = [*phase_patterns("column", 16.0), *phase_patterns("column", 18.0), *phase_patterns("column", 21.0)]
@@ -50,6 +61,18 @@ def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
     result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)
     assert not mixed(result)
     assert gamma != 1.0 or result.maps.mask[~scene.shaded].mean() > 0.9
+
+
+@pytest.mark.parametrize("patterns", [[*NUMBERED, *BLACK_WHITE], SEVERAL, THREE], ids=["numbered", "several", "three steps"])
+@pytest.mark.parametrize(("gain", "more"), [(0.8, 0.0), (1.0, 0.1)], ids=["a lamp that fades", "light of the room that grows"])
+def test_light_that_changes_between_frames_is_named(tmp_path, scene, patterns, gain, more):
+    """It changes evenly over the sequence: of a wave as much as falls to its shifts, which σ holds."""
+    order = np.linspace(0, 1, len(patterns))[:, None, None]
+    light = grey_light(scene, patterns) * (1 + (gain - 1) * order) + more * scene.albedo[..., 1] * order
+    result = depth_under(tmp_path, patterns, light)
+    off = np.abs(result.maps.depth - scene.depth)[result.maps.mask] / result.maps.sigma[result.maps.mask]
+    assert len(result.warnings) == 1 and "light has changed between the frames" in result.warnings[0]
+    assert result.maps.mask[~scene.shaded].mean() > 0.9 and (off > 5).mean() < 0.02
 
 
 def test_three_steps_of_a_declared_response_raise_no_doubt(tmp_path, scene):
