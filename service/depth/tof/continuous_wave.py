@@ -21,7 +21,15 @@ from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
 from service.depth.tof.inside_out import misread_shape
-from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, misread_direction, misread_frequencies, unfitting_images
+from service.depth.tof.phase_checks import (
+    DOUBTED,
+    Phases,
+    beyond_span,
+    full_reading,
+    misread_direction,
+    misread_frequencies,
+    unfitting_images,
+)
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -163,7 +171,12 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     nearest = near_m or 0.0
     farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
     require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
-    noise, source = _noise(frames, calibration, limit, usable)
+    warnings: list[str] = []
+    if limit is None and (limit := full_reading(frames.images[:, usable.reshape(-1)])) is not None:
+        warnings.append(f"saturation: is not given, and the readings of {(frames.images >= limit).any(axis=0).sum()} pixels stop at "
+                        f"{limit:g}, as those of a full camera: these are taken for saturated")
+    whole = usable if limit is None else usable & (frames.images < limit).all(axis=0).reshape(usable.shape)
+    noise, source = _noise(frames, calibration, whole)
     found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
                    device=device)
     found = _straighten(found, calibration)
@@ -203,7 +216,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
 
     phase, spread = (to_numpy(array)[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
     size_rad = np.inf
-    wrong = unfitting_images(frames.images, frames.modulation_hz, frames.reference_phase_rad, frames.scale, usable)
+    wrong = unfitting_images(frames.images, frames.modulation_hz, frames.reference_phase_rad, frames.scale, whole)
     if wrong is None and lit.any():
         wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing)
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
@@ -234,7 +247,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     }
     return RangeImage("time of flight, continuous wave", to_numpy(ranges.range)[:pixels], sigma,
                     to_numpy(found.amplitude)[:, :pixels].mean(axis=0), confidence, status, facts, DECIDED,
-                    () if wrong is None else (wrong,))
+                    (*warnings, *([] if wrong is None else [wrong])))
 
 
 def _with_phases(found: Correlation, other: Phases) -> Correlation:
@@ -263,16 +276,13 @@ def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[float, str | N
                       f"modulation_hz; {so}")
 
 
-def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:
-    """Return the noise of a reading, and where it is known from."""
+def _noise(frames: CorrelationImages, calibration: TofCalibration, whole: np.ndarray) -> tuple[Noise, str]:
+    """Return the noise of a reading, and where it is known from. `whole`: [rows, cols] bool, pixels without clipped readings."""
     if calibration.electrons_per_unit is not None and calibration.read_noise_electrons is not None:
         unit = calibration.electrons_per_unit
         return Noise(1 / unit, calibration.read_noise_electrons / unit), "calibration"
-    keep = usable.reshape(-1)
-    if limit is not None:
-        keep = keep & (frames.images < limit).all(axis=0)
-    return estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=usable.shape[1], scale=frames.scale,
-                          usable=keep), "images"
+    return estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=whole.shape[1], scale=frames.scale,
+                          usable=whole.reshape(-1)), "images"
 
 
 def _straighten(found: Correlation, calibration: TofCalibration) -> Correlation:

@@ -48,8 +48,20 @@ which on an image is not that of its phase."""
 END_PART, FEWEST_WRAPPED, WRAPPED_SHARE = 0.03, 20, 1e-4
 """Largest distance of neighbours over an end of the span, as a part of it, and number of such neighbours and their share of the pixels,
 from which on a surface runs on behind the span."""
+FULL, HEAPED = 20, 5.0
+"""Number of readings of each of two images that are the largest of all, and how many times as many they must be as are of each level of the
+tenth below, from which on a camera was full there: noise gives the largest to one, and an even wall to one image."""
 DOUBTED = 0.1
 """Factor on the probability of ranges whose frames are declared wrongly."""
+
+
+def full_reading(images: np.ndarray) -> float | None:
+    """Return the reading at which a camera was full, of [images, pixels] readings; None if they show none."""
+    top = images.max(initial=0)
+    if not top > 0 or ((images == top).sum(axis=1) >= FULL).sum() < 2:
+        return None
+    _, counts = np.unique(images[images >= 0.9 * top], return_counts=True)
+    return float(top) if counts[-1] >= HEAPED * counts[:-1].sum() / max(len(counts) - 1, 1) else None
 
 
 class Phases(NamedTuple):
@@ -81,6 +93,9 @@ def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Pha
 def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
     """Yield other ways to understand the phases of several frequencies, and what to check."""
     hz, same = phases.hz, np.ones(len(phases.hz))
+    for quarters, words in enumerate(("a quarter", "half", "three quarters"), start=1):
+        yield (phases._replace(phase=(phases.phase + quarters * np.pi / 2) % (2 * np.pi)),
+               f"reference_phase_rad is {words} of a turn more: check it, the order of the images, and their sign")
     for a, b in combinations(range(len(hz)), 2):
         swapped = hz.copy()
         swapped[[a, b]] = hz[[b, a]]

@@ -90,6 +90,25 @@ def test_frequencies_that_are_declared_wrongly_are_named(tmp_path, declared, wor
     assert words in result.warnings[0]
 
 
+def test_images_that_begin_at_another_phase_are_named(tmp_path):
+    images, settings = under()
+    result = measured(tmp_path, images, [(hz, (delta - np.pi / 2) % (2 * np.pi)) for hz, delta in settings])
+    assert not result.maps.mask.any() and "reference_phase_rad is a quarter of a turn more" in result.warnings[0]
+
+
+@pytest.mark.parametrize("hz", [HZ, (12e6,)], ids=["three", "one"])
+def test_readings_that_stop_at_one_level_are_saturated(tmp_path, hz):
+    """A camera that was full in one reading of seven: what is left is right. An even wall without noise is not called full."""
+    images, settings = under(hz)
+    full = np.percentile(images, 85)
+    clipped = measured(tmp_path / "clipped", np.minimum(images, full), settings)
+    off = (np.abs(clipped.maps.range - VIEW.distance) / np.maximum(clipped.maps.sigma, 1e-9))[clipped.maps.mask]
+    assert "those of a full camera" in clipped.warnings[0] and len(clipped.warnings) == 1
+    assert clipped.maps.mask.mean() > 0.5 and (off > 5).mean() < 0.02
+    even = tof.View(np.full((ROWS, COLS), 1.3), np.full((ROWS, COLS), 0.5), np.ones((ROWS, COLS)))
+    assert not any("full" in said for said in measured(tmp_path / "even", tof.correlations(even, 2e5, settings), settings).warnings)
+
+
 def test_one_frequency_that_runs_backwards_is_named(tmp_path):
     images, settings = under()
     result = measured(tmp_path, images, [(hz, -delta % (2 * np.pi) if hz == 50e6 else delta) for hz, delta in settings])
