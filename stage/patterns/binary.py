@@ -100,6 +100,11 @@ class BinaryCode(NamedTuple):
         """Return how many stripes the code numbers: the projector shows as many or fewer."""
         return 2**len(self.frames)
 
+    def without(self, bits: int) -> "BinaryCode":
+        """Return the code of wider stripes that is left without so many of the finest bits, if none is laid over others."""
+        return self._replace(frames=self.frames[bits:], inverses=None if self.inverses is None else self.inverses[bits:],
+                             stripe_px=self.stripe_px * 2**bits)
+
     @classmethod
     def collect(cls, frames: Mapping[BinaryPattern | XorPattern, int]) -> "BinaryCode":
         """Sort the frames of one code by bit."""

@@ -51,16 +51,16 @@ class PatternProjector(NamedTuple):
     """The part of white by which light that has changed between the frames moves the mean of waves: its error is added to the deviation."""
     edge_error_px: float = EDGE_ERROR
     """The error in camera pixels of an edge of stripes, as of `measured_edge_error`."""
-    unseen_digits: tuple[int, int] = (0, 0)
-    """Number of the finest digits of k-ary codes along columns and rows that the camera does not resolve, as of `unseen_digits`."""
+    unseen_digits: tuple[tuple[str, Axis, int], ...] = ()
+    """Codes of k-ary digits or plain bits and their axes, and the number of the finest that the camera does not resolve."""
 
     def extent(self, axis: Axis) -> int:
         """Return the projector's pixels along an axis."""
         return self.resolution[0 if axis == "column" else 1]
 
-    def unseen(self, axis: Axis) -> int:
-        """Return the number of unseen digits along an axis."""
-        return self.unseen_digits[0 if axis == "column" else 1]
+    def unseen(self, code: BinaryCode | KaryCode) -> int:
+        """Return the number of unseen digits of a code."""
+        return sum(count for name, axis, count in self.unseen_digits if (name, axis) == (code.name, code.axis))
 
     def levels_of(self, code: KaryCode) -> np.ndarray:
         """Return the readings of the values of a digit as parts of white minus black, [k, channels], one channel for grey levels."""

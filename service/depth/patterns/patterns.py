@@ -227,7 +227,7 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
             collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
         collected = collected._replace(codes=tuple(
-            code.without(projector.unseen(code.axis)) if isinstance(code, KaryCode) else code for code in collected.codes))
+            code.without(projector.unseen(code)) if isinstance(code, BinaryCode | KaryCode) else code for code in collected.codes))
         columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
         rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
         return PatternCodes(collected, columns, rows, unused_columns + unused_rows)

@@ -1,4 +1,4 @@
-"""What the camera does not see of stripes: edges that pass between two pixels, and digits whose stripes are finer than its pixels or blur.
+"""What the camera does not see of stripes: edges that pass between two pixels, and digits and bits that are finer than its pixels or blur.
 
 Pixels of a camera see about as much of a surface as they are apart, and an edge changes the light of one of them at least. Images that are
 rendered or shrunk without a filter show points of the surface: an edge lies anywhere between two of them.
@@ -11,6 +11,7 @@ import numpy as np
 
 from kernels.structured.edges import EDGE_ERROR, WHOLE, edge_error_of
 from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.code_checks import read_stripes
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import LIT_SIGMAS, Sample
 from service.depth.patterns.readings import line_readings
@@ -52,12 +53,18 @@ def measured_edge_error(planes: Planes, mask: np.ndarray, collected: Collected, 
     return edge_error_of(whole / seen)
 
 
-def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> tuple[int, int]:
-    """Return how many of the finest digits of k-ary codes, along columns and along rows, the camera does not resolve."""
-    found: dict[Axis, int] = {"column": 0, "row": 0}
+def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjector,
+                  noise: NoiseModel) -> tuple[tuple[str, Axis, int], ...]:
+    """Return the codes of k-ary digits and plain bits, their axes, and how many of the finest digits the camera does not resolve."""
+    found: list[tuple[str, Axis, int]] = []
     for code in collected.codes:
+        if isinstance(code, BinaryCode) and code.name == "binary":
+            stripes = read_stripes(sample, code, collected, noise)
+            count = 0 if stripes is None else max(stripes.finest - 1, 0)  # the last is wrong by a stripe at most, within five deviations
+            found.append((code.name, code.axis, count))
         if not isinstance(code, KaryCode) or collected.white is None or collected.black is None:
             continue
+        count = 0
         levels, light = projector.levels_of(code), sample.digit_light(code)
         own = np.array(code.colors) if code.colors is not None else levels
         outer = np.flatnonzero(((own == own.min(axis=0)) | (own == own.max(axis=0))).all(axis=1))
@@ -70,16 +77,21 @@ def unseen_digits(sample: Sample, collected: Collected, projector: PatternProjec
             seen = np.any([np.abs(part - levels[level]).max(axis=1) < reach[level] for level in outer], axis=0)
             if seen.mean() > SEEN_PART[light.shape[1]] * len(outer) / code.base:
                 break
-            found[code.axis] += 1
-    return found["column"], found["row"]
+            count += 1
+        found.append((code.name, code.axis, count))
+    return tuple(found)
 
 
 def unseen_sentences(codes: Collected, projector: PatternProjector) -> list[str]:
-    """Return what is said of digits that the camera does not resolve, of the codes that are left without them."""
-    return [f"frames[].pattern: the camera does not resolve the finest {f'{number} digits' if number > 1 else 'digit'} of the {code.axis} "
-            f"kary code: {'they are' if number > 1 else 'it is'} left out, and stripes are {code.stripe_px:g} px wide; focus projector and "
-            "camera, or project wider stripes"
-            for code in codes.codes if isinstance(code, KaryCode) and (number := projector.unseen(code.axis))]
+    """Return what is said of digits and bits that the camera does not resolve, of the codes that are left without them."""
+    said = []
+    for code in codes.codes:
+        if isinstance(code, BinaryCode | KaryCode) and (number := projector.unseen(code)):
+            what = "bit" if isinstance(code, BinaryCode) else "digit"
+            said.append(f"frames[].pattern: the camera does not resolve the finest {f'{number} {what}s' if number > 1 else what} of the "
+                        f"{code.axis} {code.name} code: {'they are' if number > 1 else 'it is'} left out, and stripes are "
+                        f"{code.stripe_px:g} px wide; focus projector and camera, or project wider stripes")
+    return said
 
 
 def _pairs_of_rows(planes: Planes, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

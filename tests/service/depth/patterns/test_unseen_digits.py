@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.projected_scenes import Ball, Wall, World, trace, write_capture
+from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns, palette
 from tests.marks import first_short
 from tests.scenes.depth import depth_of
@@ -67,3 +68,14 @@ def test_digits_that_are_not_resolved_are_left_out(tmp_path, light, base, reflec
     assert len(said) == (digits > 0)
     assert all((f"finest {digits} digits" if digits > 1 else "finest digit of") in warning for warning in said)
     assert all(f"stripes are {base**digits} px wide" in warning for warning in said)
+
+
+@pytest.mark.parametrize("inverses", [True, False])
+@first_short(("blur_px", "stripe_px"), [(4.0, 8), (0.4, 1)])
+def test_plain_bits_that_are_not_resolved_are_left_out(tmp_path, light, inverses, blur_px, stripe_px):
+    """Of bits that hardly a pixel reads the coarsest stays: it is wrong by a stripe at most, and σ is that of an edge then."""
+    found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light,
+                        binary_patterns(320, "column", code="binary", inverses=inverses))
+    assert (off > 5).mean() < 0.01 and len(off) > 0.95 * (light.lit & np.isfinite(light.depth)).sum()
+    said = [warning for warning in found.warnings if "does not resolve" in warning]
+    assert [f"stripes are {stripe_px} px wide" in warning for warning in said] == [True] * (stripe_px > 1)
