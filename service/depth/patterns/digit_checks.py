@@ -7,13 +7,14 @@ import numpy as np
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
-from service.depth.patterns.response_checks import EXPONENTS
 from service.depth.patterns.stripe_steps import CLEAR_BIT, CLEAR_SIGMAS, JUMP, READ_SHARE, Pairs, mends
 from stage.patterns.codes import Collected
 from stage.patterns.kary import KaryCode, number_of
 
 LEFT_JUMPS = 0.1
 """Jumps, as a part of all steps, below which stripes of k-ary digits follow each other."""
+EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
+"""Exponents of light = level^γ that are compared."""
 BENT_LEFT, LEAST_BENT = 0.65, 0.02
 """Part of the mean distance of readings from the levels of digits, of white, that levels of another exponent leave, and least distance,
 from which on that exponent is named: noise, blur and bounced light leave more with any other."""

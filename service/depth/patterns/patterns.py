@@ -205,7 +205,7 @@ def checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projec
     if wrong is not None:
         return Checks([wrong], codes, False)
     bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or find_exponent(
-        sample, codes.collected, shown, noise, device)
+        sample, codes.collected, shown, noise)
     said = [sentence for sentence in (waves.unconfirmed, changed) if sentence is not None]
     names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
     if projector is not None and projector.principal_px is None and len(names) == 1:

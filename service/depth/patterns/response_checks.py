@@ -1,9 +1,9 @@
 """Whether light is linear in the levels that a projector shows: the exponent γ of light = level^γ that waves show, and ramps.
 
 Between black and white the mean of a wave is a half, unless it is bent, and has a second harmonic then, or the light has changed between
-frames. Readings of five frames or more lie off a wave that is bent. Three or four leave too few over for that. But the second harmonic adds
-to the fitted amplitude in turn with three times the phase; the amplitude over the mean does not depend on albedo, and under an unbent wave
-not on the phase. What else changes it, ambient light and blur, changes slowly over the wave or not with it at all.
+frames. Four frames or more tell that harmonic. To the fitted amplitude of three it adds in turn with three times the phase; the amplitude
+over the mean does not depend on albedo, and under an unbent wave not on the phase. What else changes it, ambient light and blur, changes
+slowly over the wave or not with it at all.
 
 A rising ramp and the falling one are white and black together, at every place. Where the projector's response or the images bend light, the
 sum is least right half way between the borders; where the light has changed, it is wrong there as at the borders.
@@ -13,59 +13,48 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kernels.device import to_numpy
-from kernels.errors import KernelError
-from kernels.status import OK
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
-from kernels.structured.response import bent_wave, fitted_curve, light_of
-from service.depth.patterns.codes import choose_decoder
+from kernels.structured.response import bent_wave, light_of
 from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.levels import STEADY
-from service.depth.patterns.pattern_checks import ENOUGH, LEAST_SIGNAL, Sample, decode_sample
+from service.depth.patterns.pattern_checks import ENOUGH, LEAST_SIGNAL, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
-from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.patterns.phase import FULL_STEPS, PhaseCode, Wave
 from stage.patterns.ramp import RampCode
 
 MEAN_TOLERANCE = 0.04
 """Distance of the mean of a wave from half of white above which the projector is not linear; photographs have 0.01."""
-EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
-"""Exponents of light = level^γ that are compared."""
-BAD_FIT, BETTER_FIT = 3.0, 0.5
-"""Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
+EXPONENTS = 0.3, 4.0
+"""Least and greatest exponent of light = level^γ that is found."""
 IN_A_BIN = 30
-"""Pixels that tell the modulation in a part of a turn, or the sum of ramps in a part of the way between the borders."""
+"""Pixels that tell the sum of ramps in a part of the way between the borders."""
 TURN_BINS, LEAST_TURN_BINS = 36, 24
 """Parts of a turn, and number of these that must be seen."""
 CLEAR_SIGMAS = 20.0
 """Least amplitude of pixels that tell the modulation, in its standard deviations."""
-TREND = 3
-"""Number of terms of the polynomial that other changes of the modulation may follow along the wave."""
-MISFIT = 0.25
-"""Part of the misfit of an unbent wave that a bent one must leave at most."""
-LEAST_CHANGE = 0.02
-"""Root mean square change of the modulation along the wave, as a part of it, below which it is even."""
 RAMP_BINS, LEAST_RAMP_BINS = 20, 8
 """Parts of the way between the borders, and number of these that must be seen."""
 MOST_BENT, MOST_CHANGED = 0.08, 0.12
 """Largest part of white minus black by which bent light makes the sum wrong half way, and changed light anywhere: lamps flicker by less,
 and images that were sharpened have 0.05."""
-LEAST_HARMONIC, BENT_PART = 0.03, 0.25
-"""Second harmonic, over the first, that the mean of waves must lead to expect for its absence to tell, and the part of it from which on
-they are bent: bent waves have .45 to 1.5 of it, less where blur hides it, and those under light that has changed .03 at most."""
+BENT, LEAST_HARMONIC, BENT_PART = 0.05, 0.03, 0.25
+"""Second harmonic, over the first, from which on waves are bent (right ones have .034 at most), the one that their mean must lead to expect
+for its absence to tell, and the part of it from which on they are bent then: bent waves have .45 to 1.5 of it, less where blur hides it,
+and those under light that has changed .03 at most."""
 STEPS = 1024
 """Number of places at which a declared response is looked up."""
 
 
-def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> PatternProjector:
+def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> PatternProjector:
     """Return the projector with the exponent γ of light = level^γ that the waves of a capture show, and with the light that changed; itself
     where they are as they should be."""
     for code in collected.codes:
         if isinstance(code, PhaseCode):
             found = _exponent_of_mean(sample, code, collected, projector, noise)
             if found is None:
-                found = projector._replace(exponent=_exponent_of_fit(sample, code, collected, projector, noise, device))
+                found = projector._replace(exponent=_exponent_of_harmonic(sample, code, noise))
             if found != projector:
                 return found
     return projector
@@ -95,97 +84,46 @@ def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, pro
     mean = float(np.median([np.median((np.mean(grey[list(wave.frames)], axis=0) - dark) / span) for wave in even]))
     if abs(mean - 0.5) <= MEAN_TOLERANCE:
         return projector
-    fine = np.linspace(0.3, 4.0, 371)
+    fine = np.linspace(*EXPONENTS, 371)
     table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
     exponent = float(np.interp(-mean, -np.array(table), fine))
-    bends = np.array([_second_harmonic(grey[list(wave.frames)], np.array(wave.shifts), wave.period_px, span, exponent) for wave in even])
-    seen, expected = np.median(bends, axis=0)
+    harmonics = np.abs(np.fft.rfft(bent_wave(np.linspace(0, 1, 256)**exponent), norm="forward")[:3])
+    seen, swing = np.median([_second_harmonic(wave, grey, span) for wave in even], axis=0)
+    sharp = min(swing / (2 * harmonics[1]), 1.0)
+    expected = np.sign(exponent - 1) * harmonics[2] / harmonics[1] * sharp**3  # blur dims the second as the fourth power of the first
     if abs(expected) > LEAST_HARMONIC and seen / expected < BENT_PART:
         return projector._replace(changed=abs(mean - 0.5))
     return projector._replace(exponent=exponent)
 
 
-def _second_harmonic(readings: np.ndarray, shifts: np.ndarray, period_px: float, span: np.ndarray,
-                     exponent: float) -> tuple[float, float]:
-    """Return the second harmonic of a wave, over the first, and that of this exponent under the blur that dims the first.
-    `readings`: [frames, pixels]. `shifts`: [frames] turns. `span`: [pixels], white less black."""
-    fit = weights(shifts, period_px).T @ readings
-    along = fit[1] + 1j * fit[2]
-    swing = np.abs(along)
-    harmonics = np.abs(np.fft.rfft(bent_wave(np.linspace(0, 1, 256)**exponent), norm="forward")[:3])
-    sharp = min(float(np.median(swing / span)) / (2 * harmonics[1]), 1.0)
+def _exponent_of_harmonic(sample: Sample, code: PhaseCode, noise: NoiseModel) -> float:
+    """Return the exponent whose waves have the second harmonic that is seen, (γ - 1)/(γ + 2) of the first; 1.0 where none is."""
+    found = []
+    for wave in (wave for wave in code.waves if len(wave.frames) >= FULL_STEPS):
+        table = weights(np.array(wave.shifts), wave.period_px)
+        mean, along, across = table.T @ sample.grey[list(wave.frames)]
+        deviation = np.sqrt(noise.variance(mean) * (table[:, 1:]**2).sum(axis=0).max())
+        good = sample.whole & (np.hypot(along, across) > CLEAR_SIGMAS * deviation) & (mean > 0)
+        place = np.floor(np.arctan2(across, along)[good] / (2 * np.pi) * TURN_BINS)
+        if good.sum() >= ENOUGH and len(np.unique(place)) >= LEAST_TURN_BINS:
+            found.append(_second_harmonic(wave, sample.grey[:, good], mean[good])[0])
+    part = float(np.median(found)) if found else 0.0
+    return float(np.clip((1 + 2 * part) / (1 - part), *EXPONENTS)) if abs(part) > BENT else 1.0
+
+
+def _second_harmonic(wave: Wave, grey: np.ndarray, light: np.ndarray) -> tuple[float, float]:
+    """Return the second harmonic of a wave over the first, and the first over the light of the pixels.
+    `grey`: [frames, pixels]. `light`: [pixels], white less black, or the mean of the wave: what is in proportion to the albedo."""
+    readings, shifts = grey[list(wave.frames)], np.array(wave.shifts)
+    _, along, across = weights(shifts, wave.period_px).T @ readings
+    phasor = along + 1j * across
+    swing = np.abs(phasor)
+    whole = float(np.median(swing / light))
     three = len(shifts) == FULL_STEPS  # the second harmonic changes the swing then, in turn with three times the phase
-    part = swing / span / np.median(swing / span) if three else 2 / len(shifts) * (np.exp(4j * np.pi * shifts) @ readings) / swing
-    terms = np.stack([(along / swing) ** power for power in range(-3, 4)], axis=1)
+    part = swing / light / whole if three else 2 / len(shifts) * (np.exp(4j * np.pi * shifts) @ readings) / swing
+    terms = np.stack([(phasor / swing) ** power for power in range(-3, 4)], axis=1)
     fitted = np.linalg.lstsq(terms, part.astype(complex), rcond=None)[0]
-    seen = 2 * fitted[6].real if three else fitted[5].real
-    return seen, np.sign(exponent - 1) * harmonics[2] / harmonics[1] * sharp**3  # of a Gaussian: the second is dimmed as its fourth power
-
-
-def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
-                     device: str) -> float:
-    """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
-    grey = sample.grey[list(code.frames)].astype(np.float64)
-    if len(code.frames) < 5:  # offset, amplitude and place leave one reading over at most
-        alone = len(set(code.periods_px)) == 1
-        return _exponent_of_swing(grey[:, sample.whole], code.shifts, code.periods_px[0], noise) if alone else 1.0
-    variance = noise.variance(grey.mean(axis=0))
-    misfit = {}
-    for exponent in EXPONENTS:
-        response = np.linspace(0, 1, 256)**exponent
-        bent = projector._replace(response=None if exponent == 1.0 else tuple(response.tolist()))
-        try:
-            decoder, _ = choose_decoder(collected, code.axis, bent)
-            if decoder is None:
-                return 1.0
-            decoded = decode_sample(sample, decoder, noise, device)
-        except KernelError:  # two places look alike under this response
-            continue
-        u, status = (to_numpy(array)[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
-        keep = (status == OK) & sample.mask.ravel()
-        if keep.sum() < ENOUGH:
-            continue
-        wave = bent_wave(response)
-        turns = (u[keep] / np.array(code.periods_px)[:, None] - np.array(code.shifts)[:, None]) % 1.0
-        light = np.interp(turns, np.arange(len(wave) + 1) / len(wave), np.append(wave, wave[0]))
-        light -= light.mean(axis=0)
-        seen = grey[:, keep] - grey[:, keep].mean(axis=0)
-        rest = (seen**2).sum(axis=0) - (light * seen).sum(axis=0)**2 / np.maximum((light**2).sum(axis=0), 1e-12)
-        misfit[exponent] = float(np.median(rest / variance[keep]) / (len(code.frames) - 3))
-    plain = misfit.get(1.0, float("nan"))
-    if not misfit or not plain > BAD_FIT:
-        return 1.0
-    best = min(misfit, key=lambda exponent: misfit[exponent])
-    return best if misfit[best] < BETTER_FIT * plain else 1.0
-
-
-def _exponent_of_swing(grey: np.ndarray, shifts: Sequence[float], period_px: float, noise: NoiseModel) -> float:
-    """Return the exponent γ of light = level^γ that explains how the modulation changes along the wave; 1.0 where it does not change so.
-    `grey`: [frames, pixels] readings of one period, without saturated ones. `shifts`: of each frame in turns."""
-    own = np.array(shifts)
-    table = weights(own, period_px)
-    mean, along, across = table.T @ grey
-    swing = np.hypot(along, across)
-    deviation = np.sqrt(noise.variance(mean) * (table[:, 1:]**2).sum(axis=0).max())
-    good = (swing > CLEAR_SIGMAS * deviation) & (mean > 0)
-    ratio = np.log(swing[good] / mean[good])
-    place = (np.arctan2(across[good], along[good]) / (2 * np.pi) % 1.0 * TURN_BINS).astype(int) % TURN_BINS
-    seen = np.flatnonzero(np.bincount(place, minlength=TURN_BINS) >= IN_A_BIN)
-    if len(seen) < LEAST_TURN_BINS:
-        return 1.0
-    modulation = np.array([np.median(ratio[place == part]) for part in seen])
-    turns = (seen + 0.5) / TURN_BINS
-    trend = np.vander(turns - 0.5, TREND)
-    misfit = {}
-    for exponent in EXPONENTS:
-        curve, level = fitted_curve(bent_wave(np.linspace(0, 1, 256)**exponent), table, own)
-        fitted = np.angle(curve) / (2 * np.pi) % 1.0
-        order = np.argsort(fitted)
-        expected = np.interp(turns, fitted[order], np.log(np.abs(curve) / level)[order], period=1.0)
-        rest = modulation - expected
-        misfit[exponent] = float(np.sqrt(np.mean((rest - trend @ np.linalg.lstsq(trend, rest, rcond=None)[0])**2)))
-    best = min(misfit, key=lambda exponent: misfit[exponent])
-    return best if misfit[1.0] > LEAST_CHANGE and misfit[best]**2 < MISFIT * misfit[1.0]**2 else 1.0
+    return 2 * fitted[6].real if three else fitted[5].real, whole
 
 
 def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
