@@ -116,8 +116,11 @@ def _second_harmonic(wave: Wave, grey: np.ndarray, light: np.ndarray) -> tuple[f
     `grey`: [frames, pixels]. `light`: [pixels], white less black, or the mean of the wave: what is in proportion to the albedo."""
     readings, shifts = grey[list(wave.frames)], np.array(wave.shifts)
     _, along, across = weights(shifts, wave.period_px).T @ readings
-    phasor = along + 1j * across
-    swing = np.abs(phasor)
+    swing = np.hypot(along, across)
+    seen = (swing > 0) & (light > 0)
+    if not seen.any():
+        return 0.0, 0.0
+    readings, phasor, swing, light = readings[:, seen], (along + 1j * across)[seen], swing[seen], light[seen]
     whole = float(np.median(swing / light))
     three = len(shifts) == FULL_STEPS  # the second harmonic changes the swing then, in turn with three times the phase
     part = swing / light / whole if three else 2 / len(shifts) * (np.exp(4j * np.pi * shifts) @ readings) / swing

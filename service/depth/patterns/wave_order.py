@@ -10,7 +10,9 @@ from itertools import combinations, permutations
 import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.phase import weights
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from service.depth.patterns.response_checks import LEAST_TURN_BINS, TURN_BINS
 from stage.patterns.codes import Collected
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 
@@ -80,7 +82,9 @@ def _other_order(code: PhaseCode, grey: np.ndarray, noise: NoiseModel) -> str | 
         order[:, [first, second]] = declared[:, [second, first]]
         found.append((left(order), " and ".join(map(str, sorted((named[0][first], named[0][second]))))))
     exchanges = len(found)
-    for other in (steps - 1, steps + 1):  # both ends of a period, and all steps but the last
+    _, along, across = weights(np.array(code.waves[0].shifts), code.waves[0].period_px).T @ grey[list(code.waves[0].frames)]
+    seen = len(np.unique(np.floor(np.arctan2(across, along) / (2 * np.pi) * TURN_BINS))) >= LEAST_TURN_BINS
+    for other in (steps - 1, steps + 1) if seen else ():  # both ends of a period, and all steps but the last
         over = _without_waves(code, len(grey), steps / other)[roles][:, roles]
         found.append((left(declared, over), f"a step is 1/{other} of a period: check step and steps in the frames' patterns"))
     taken = np.argsort(np.argsort(roles))  # place of each frame in the sequence

@@ -21,15 +21,7 @@ from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
 from service.depth.tof.inside_out import misread_shape
-from service.depth.tof.phase_checks import (
-    DOUBTED,
-    Phases,
-    beyond_span,
-    full_reading,
-    misread_direction,
-    misread_frequencies,
-    unfitting_images,
-)
+from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, full_at, misread_direction, misread_frequencies, unfitting_images
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -172,7 +164,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
     require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
     warnings: list[str] = []
-    if limit is None and (limit := full_reading(frames.images[:, usable.reshape(-1)])) is not None:
+    if limit is None and (limit := full_at(frames.images[:, usable.reshape(-1)])) is not None:
         warnings.append(f"saturation: is not given, and the readings of {(frames.images >= limit).any(axis=0).sum()} pixels stop at "
                         f"{limit:g}, as those of a full camera: these are taken for saturated")
     whole = usable if limit is None else usable & (frames.images < limit).all(axis=0).reshape(usable.shape)

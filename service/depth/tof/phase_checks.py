@@ -55,7 +55,7 @@ DOUBTED = 0.1
 """Factor on the probability of ranges whose frames are declared wrongly."""
 
 
-def full_reading(images: np.ndarray) -> float | None:
+def full_at(images: np.ndarray) -> float | None:
     """Return the reading at which a camera was full, of [images, pixels] readings; None if they show none."""
     top = images.max(initial=0)
     if not top > 0 or ((images == top).sum(axis=1) >= FULL).sum() < 2:

@@ -39,6 +39,17 @@ def test_right_orders_and_other_faults_raise_no_doubt_of_the_order(name, gamma):
         assert order_said(sample._replace(values=seen), patterns) is None
 
 
+@pytest.mark.parametrize("gamma", [0.45, 0.55, 2.2, 2.6])
+@pytest.mark.parametrize("steps", [4, 5])
+def test_bent_waves_of_which_half_a_turn_is_seen_are_not_taken_for_other_steps(steps, gamma):
+    patterns = list(phase_patterns("column", (EXTENT,), steps))
+    sample = frames_of(patterns, gamma=gamma)
+    for first, last in ((0, 55), (36, 109), (54, 91), (54, 109), (72, 127)):
+        mask = sample.mask.copy()
+        mask[:, :first], mask[:, last:] = False, False
+        assert order_said(sample._replace(mask=mask), patterns) is None
+
+
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 @pytest.mark.parametrize("name", ["one", "one of eight", "three"])
 def test_exchanged_steps_are_named(name, gamma):
