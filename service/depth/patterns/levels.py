@@ -44,6 +44,10 @@ ALIKE = 0.3
 the room that comes on .2, and mixed patterns 1 and more."""
 STEADY = "let the projector warm up, switch off its dynamic modes and the camera's automatic exposure, and keep other light out"
 """What to do about light that changes between frames."""
+MOST_UNEVEN, STRIPES = 0.05, 20
+"""Largest distance from a half, the way from black to white, of the mean of a bit without an inverse, and least number of stripes of the
+next coarser bits that it is told of: right captures have 0.007 at most, sharp, blurred and unresolved ones; images that are encoded 0.03 to
+0.17, and automatic exposure leaves 0.3."""
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 MOVED_SIGMAS, MOVED_PART = 6.0, 0.04
@@ -172,6 +176,29 @@ def check_levels(sample: Sample, collected: Collected, projector: PatternProject
             "and their inverses, or waves over their shifts, do not add up to the same light): the camera has recorded parts of two "
             "patterns, or what it sees has moved: wait longer for each pattern, or synchronise projector and camera"
             f"{UNKNOWN_RESPONSE if unknown else ''}")
+
+
+def uneven_halves(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
+    """Return a sentence if the finest bits without inverses are not, in the mean, half-way between black and white, as linear images of one
+    exposure are however sharp; None if they are."""
+    grey = sample.grey
+    lit = sample.lit(grey, noise)
+    if collected.white is None or collected.black is None or lit.sum() < ENOUGH:
+        return None
+    black, span = grey[collected.black, lit], (grey[collected.white] - grey[collected.black])[lit]
+    seen = span > LIT_SIGMAS * np.sqrt(noise.variance(grey[collected.white, lit]))
+    for code in collected.codes:
+        alone = all(other is code or other.axis != code.axis for other in collected.codes)  # else waves tell places in its stripes
+        if not isinstance(code, BinaryCode) or code.inverses is not None or not alone or not seen.any():
+            continue
+        parts = (grey[list(code.frames)][:, lit] - black)[:, seen] / span[seen]
+        coarser = np.unique(parts[1:] > 0.5, axis=1).shape[1]
+        mean = float(parts[0].mean())
+        if coarser >= STRIPES and abs(mean - 0.5) > MOST_UNEVEN:
+            return (f"frames[]: the finest bit of the {code.axis} {code.name} code is, in the mean, {100 * mean:.0f} % of the way from "
+                    "black to white, where linear images have 50 %: images are encoded (color_space), or white and black were exposed "
+                    "otherwise than the bits; edges of stripes lie aside by it: give linear images of one exposure, or show inverses")
+    return None
 
 
 def light_sentence(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:

@@ -20,7 +20,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.lag import widen_lagging
-from service.depth.patterns.levels import check_levels, light_sentence, moved_pixels
+from service.depth.patterns.levels import check_levels, light_sentence, moved_pixels, uneven_halves
 from service.depth.patterns.measured_noise import SAID_NOISIER, with_measured_noise
 from service.depth.patterns.missed_frames import check_frames
 from service.depth.patterns.mixture import widen_mixed
@@ -206,7 +206,8 @@ def checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projec
         return Checks([wrong], codes, False)
     bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or find_exponent(
         sample, codes.collected, shown, noise)
-    said = [sentence for sentence in (waves.unconfirmed, changed) if sentence is not None]
+    uneven = uneven_halves(sample, codes.collected, measured)
+    said = [sentence for sentence in (waves.unconfirmed, changed, uneven) if sentence is not None]
     names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
     if projector is not None and projector.principal_px is None and len(names) == 1:
         said.append("projector.principal_px: is missing, and the middle of its image is taken, which patterns of one axis cannot confirm: "

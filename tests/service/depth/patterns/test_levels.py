@@ -75,6 +75,17 @@ def test_light_that_changes_between_frames_is_named(tmp_path, scene, patterns, g
     assert result.maps.mask[~scene.shaded].mean() > 0.9 and (off > 5).mean() < 0.02
 
 
+@pytest.mark.parametrize(("gamma", "white", "named"), [(1.0, 1.0, False), (1 / 2.2, 1.0, True), (1.0, 0.7, True)],
+                         ids=["linear", "encoded", "automatic exposure"])
+def test_bits_that_are_not_half_bright_between_black_and_white_are_named(tmp_path, scene, gamma, white, named):
+    """A Gray code without inverses, blurred by a pixel: encoding moves the edges of its stripes, and so does white of another exposure."""
+    patterns = [*gray_patterns("column", inverse=False), *BLACK_WHITE]
+    light = gaussian_filter1d(grey_light(scene, patterns), 1.0, axis=2)
+    light[-1] *= white
+    said = depth_under(tmp_path, patterns, light**gamma).warnings
+    assert any("in the mean" in sentence and "column gray code" in sentence for sentence in said) == named
+
+
 def test_three_steps_of_a_declared_response_raise_no_doubt(tmp_path, scene):
     """Three shifts do not even out the third harmonic of a response that is steep in the middle: their sums differ as it says."""
     def steep(level):
