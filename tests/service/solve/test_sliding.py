@@ -6,6 +6,7 @@ from scipy.ndimage import shift
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
+from tests.marks import first_short
 from tests.scenes.captures import Scene, angles_degrees, write_capture
 from tests.scenes.parts import sphere_lights
 from tests.scenes.surfaces import make_ball
@@ -33,7 +34,7 @@ def solved(folder, slide_px, *, lights=24, wide=0.0, method=Method.ROBUST):
     return [warning for warning in result.warnings if "what the camera sees moves" in warning], error[known] / result.maps.sigma[known]
 
 
-@pytest.mark.parametrize("slide_px", [2.0, pytest.param(4.0, marks=pytest.mark.long)])
+@first_short("slide_px", [2.0, 4.0])
 def test_a_slide_is_named(tmp_path, slide_px):
     """With its length, rather too little: the solved normals have taken up a part of it."""
     found, = solved(tmp_path, slide_px)[0]
@@ -47,6 +48,6 @@ def test_sigma_holds_what_a_slide_makes(tmp_path):
     assert np.quantile(solved(tmp_path, 4.0, lights=40, wide=0.5, method=Method.SVBRDF)[1], 0.95) < 2.5
 
 
-@pytest.mark.parametrize("wide", [0.0, 0.5])
+@first_short("wide", [0.5, 0.0])
 def test_a_steady_object_is_not(tmp_path, wide):
     assert solved(tmp_path, 0.0, wide=wide)[0] == []
