@@ -1,4 +1,4 @@
-"""A V-groove of two planes at right angles, along y, seen from +z, with all bounces of light: radiosity in float64.
+"""A V-groove of two planes at right angles, and a round one, along y, seen from +z, with all bounces of light: radiosity in float64.
 
 Imports nothing of ours.
 """
@@ -40,3 +40,23 @@ class Groove:
         direct = albedo / np.pi * np.where(self.shadowed(lights), 0, np.maximum(lights @ self.normals.T, 0))
         whole = np.linalg.solve(np.eye(self.side**2) - albedo * self.factors(), direct.T).T
         return whole, direct
+
+
+class Trough(Groove):
+    """The same with a round floor, a parabola whose sides rise with a slope of `steepest` at the edge."""
+
+    def __init__(self, side: int, steepest: float = 1.0):
+        super().__init__(side)
+        x, y, _ = self.points.T
+        self.bend = steepest / side
+        slope = 2 * self.bend * x
+        self.points = np.stack([x, y, self.bend * x**2], axis=-1)
+        self.areas = np.sqrt(1 + slope**2)
+        self.normals = np.stack([-slope, np.zeros_like(x), np.ones_like(x)], axis=-1) / self.areas[:, None]
+
+    def shadowed(self, lights: np.ndarray) -> np.ndarray:
+        x, y = self.points[:, 0], self.points[:, 1]
+        lx, ly, lz = (part[:, None] for part in np.asarray(lights).T)
+        length = (lz - 2 * self.bend * x * lx) / np.maximum(self.bend * lx**2, 1e-12)  # to where the way meets the parabola again
+        edge = self.side / 2
+        return (length > 0) & (np.abs(x + length * lx) < edge) & (np.abs(y + length * ly) < edge)

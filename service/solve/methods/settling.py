@@ -11,13 +11,14 @@ Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, sec
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from kernels.device import to_numpy
-from kernels.photometric.model.samples import Samples, readings_of
+from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
@@ -38,12 +39,23 @@ BLOCKS = 2500
 ROUNDS = 2
 """Rounds: the third changes the scale of albedo by 1 %."""
 BETTER, LEAST_GAIN = 0.9, 5e-4
-"""Part of the cost with bounced light taken out below which that of the whole readings shows that there is none, and the least difference:
-the part is 0.6 to 0.75 in folds and grooves as a renderer of direct light shows them, 0.97 and above where light bounces. A groove of two
-planes that all lights reach looks the same with bounced light and without, to 4e-5."""
+"""Part of the cost with bounced light taken out below which that of the whole readings shows that there is none, and the least difference,
+where the scale of the lights is unknown: the part is 0.6 to 0.75 in folds and grooves as a renderer of direct light shows them, 0.97 and
+above where light bounces. A groove of two planes that all lights reach looks the same with bounced light and without, to 4e-5."""
+DENIED = 1.08
+"""Cost with twice the bounced light taken out, over that with once, above which lit readings show that there is none, where the scale of
+the lights is known: 1.10 to 1.32 in folds as a renderer of direct light shows them, 0.82 to 1.06 where light bounces."""
 LARGEST_STRENGTH = 3.0
 """Largest strength that is taken from shadows under lights of a known scale: they show 1.2 to 2.2 where light bounces, and 4 to 100 where
 hardly any is expected."""
+TRIED = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
+"""Strengths of which lit readings choose. Their cost falls until it is 1.5 to 2.5 times what arrives, and hardly rises beyond, because no
+reading falls below zero: where half of the fall is reached, normals of glossy folds are best, or within a tenth of it. Images without
+bounced light cost more at every strength above 1."""
+COUNTED = 800
+"""Most blocks whose cost tells a strength."""
+LEAST_FALL = 0.03
+"""Part of the cost that a strength above 1 must save: 3 to 27 % in folds of dielectrics, 1 to 2.5 % where metals mirror each other."""
 UNKNOWN_STRENGTH = 0.5
 """Relative error of the strength where shadows do not tell it: 1.2 to 2.5 times the light of the form factors arrives in glossy folds, and
 1.0 to 1.2 times in matt ones."""
@@ -104,7 +116,8 @@ def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Calla
     positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     within = _middles_of(light, pick)
     shown = shown_bounce(*readings_in_shadow(light, within.pixels, normal[:, within.pixels].T, within.readings))
-    if not (has_bounced(light, shown) if shown is not None else _is_lit_by_bounces(light, normal, shape, pick, within)):
+    bounced = _is_lit_by_bounces(light, normal, shape, pick, within, relative=relative) if shown is None else has_bounced(light, shown)
+    if not bounced:
         return Settled(light._replace(arriving=None), shown)
     if light.field is not None:
         return Settled(light, shown)
@@ -120,12 +133,30 @@ def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: 
 
 
 def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples],
-                       within: Middles) -> bool:
+                       within: Middles, *, relative: bool) -> bool:
     """Return whether lit readings leave it possible that light has bounced; parameters as of `settle`."""
-    start = normal[:, within.pixels].T
-    whole, direct = (float(_searched(each, within.pixels, start, shape, pick)[1].cost.mean(dtype=np.float64))
-                     for each in (light._replace(arriving=None), light))
-    return whole >= min(BETTER * direct, direct - LEAST_GAIN)
+    cost = partial(_cost, pixels=within.pixels, start=normal[:, within.pixels].T, shape=shape, pick=pick)
+    once = cost(light)
+    if relative:
+        return cost(light._replace(arriving=None)) >= min(BETTER * once, once - LEAST_GAIN)
+    return cost(light._replace(albedo_scale=2.0)) <= max(DENIED * once, once + LEAST_GAIN)
+
+
+def _cost(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]) -> float:
+    """Return the mean cost of some of these pixels in direct light; parameters as of `_searched`."""
+    some = evenly(len(pixels), COUNTED)
+    return float(_searched(light, pixels[some], start[some], shape, pick)[1].cost.mean(dtype=np.float64))
+
+
+def _shown_by_lit(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape,
+                  pick: Callable[[np.ndarray], Samples]) -> float | None:
+    """Return the strength of the arriving light that the lit readings of some pixels show, or None where it is not above 1."""
+    costs = [_cost(light._replace(albedo_scale=each), pixels, start, shape, pick) for each in TRIED]
+    if min(costs) > (1 - LEAST_FALL) * costs[0]:
+        return None
+    half = (costs[0] + min(costs)) / 2
+    at = next(number for number, cost in enumerate(costs) if cost <= half)
+    return float(np.interp(half, costs[at - 1:at + 1][::-1], TRIED[at - 1:at + 1][::-1]))
 
 
 def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], within: Middles, *,
@@ -137,13 +168,18 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     first, albedo, start = normal, light.albedo, normal[:, middles].T
     turned = start
 
-    def of_shadows() -> ScaleFit | None:
+    def with_strength() -> tuple[DirectLight, ScaleFit | None]:
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole))
-        return fit if relative or fit is None else fit._replace(scale=min(fit.scale, LARGEST_STRENGTH))
+        if relative:
+            return light._replace(albedo_scale=1.0 if fit is None else fit.scale), fit
+        lit = _shown_by_lit(light, middles, turned, shape, pick)
+        if fit is None:
+            return light._replace(albedo_scale=lit or 1.0), None
+        fit = fit._replace(scale=min(fit.scale, LARGEST_STRENGTH))
+        return light._replace(albedo_scale=fit.scale if lit is None else max(fit.scale, (fit.scale + lit) / 2)), fit
 
     for _ in range(ROUNDS):
-        fit = of_shadows()
-        light = light._replace(albedo_scale=_value(fit))
+        light, _ = with_strength()
         samples, found = _searched(light, middles, start, shape, pick)
         turned = found.normal
         again, dimmed = first.copy(), albedo.copy()
@@ -151,9 +187,8 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
-    fit = of_shadows()
-    settled = light._replace(albedo_scale=_value(fit))
-    unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale)
+    settled, fit = with_strength()
+    unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
     ends = [_searched(settled._replace(albedo_scale=times * settled.albedo_scale), middles, turned, shape, pick)[1].normal
             for times in (1.0, 1 + unknown)]
     places = np.stack(np.divmod(middles, light.given.camera.width), axis=1)
@@ -174,11 +209,6 @@ def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     back = np.empty_like(block)
     back[order] = block
     return back, pixels[order[first]]
-
-
-def _value(fit: ScaleFit | None) -> float:
-    """Return the scale, or 1 where the images do not decide it."""
-    return 1.0 if fit is None else fit.scale
 
 
 def _turn(normals: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
