@@ -25,7 +25,7 @@ class TangentFrame(NamedTuple):
     def express(self, normal: np.ndarray) -> np.ndarray:
         """Return camera-frame normals [rows, cols, 3] in tangent space: their components along T, B = N × T, and N, float32."""
         found = np.empty(normal.shape, dtype=np.float32)
-        found[..., 0], found[..., 2] = dot(self.tangent, normal), dot(self.normal, normal)
+        found[..., 0], found[..., 2] = np.vecdot(self.tangent, normal), np.vecdot(self.normal, normal)
         t, m = np.moveaxis(self.tangent, -1, 0), np.moveaxis(normal, -1, 0)
         found[..., 1] = sum(self.normal[..., x] * (t[y] * m[z] - t[z] * m[y]) for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
         return found
@@ -48,7 +48,7 @@ class TangentFrames:
         """Return the frames of the texels of rows start … stop - 1."""
         normal, covered = _unit(self._spread(self._normals, start, stop))
         tangent = self._spread(self._tangents, start, stop)
-        tangent, _ = _unit(tangent - normal * dot(tangent, normal)[..., None])
+        tangent, _ = _unit(tangent - normal * np.vecdot(tangent, normal)[..., None])
         return TangentFrame(tangent, normal, covered)
 
     def _spread(self, grid: np.ndarray, start: int, stop: int) -> np.ndarray:
@@ -62,11 +62,6 @@ class TangentFrames:
             weight = np.expand_dims((position - low).astype(np.float32), tuple({0, 1, 2} - {axis}))
             grid = np.take(grid, low, axis=axis) * (1 - weight) + np.take(grid, high, axis=axis) * weight
         return grid
-
-
-def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the scalar products […] of vectors […, 3]; a sum over so short an axis takes NumPy several times as long."""
-    return np.asarray(first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1] + first[..., 2] * second[..., 2])
 
 
 def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
@@ -107,7 +102,7 @@ def _divided(quads: np.ndarray, points: np.ndarray, st: np.ndarray) -> np.ndarra
 
 def _in_plane(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return vectors [n, 3] without their part along unit normals, with length one; zero where nothing is left."""
-    return _unit(vectors - normals * dot(vectors, normals)[:, None])[0]
+    return _unit(vectors - normals * np.vecdot(vectors, normals)[:, None])[0]
 
 
 def _grid(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.ndarray:
@@ -120,6 +115,6 @@ def _grid(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.n
 
 def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the vectors with length one, or zero where they were zero, and where they were not zero."""
-    length = np.sqrt(dot(vectors, vectors))
+    length = np.sqrt(np.vecdot(vectors, vectors))
     present = length > 0
     return vectors / np.where(present, length, 1)[..., None], present

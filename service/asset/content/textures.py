@@ -16,7 +16,7 @@ import numpy as np
 
 from service.asset.content.mesh import SurfaceMesh
 from service.asset.content.metallic import MetallicLook
-from service.asset.content.tangent import TangentFrames, dot
+from service.asset.content.tangent import TangentFrames
 from service.errors import AssetError
 from service.requests.export import TextureFormat
 from stage.colour.colour import convert
@@ -205,7 +205,7 @@ def _tangent_bands(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> 
         rows = slice(start, min(start + BAND_ROWS, len(known)))
         frame = frames.of_rows(rows.start, rows.stop)
         vectors = np.where(known[rows][..., None], normal[rows], 0)
-        length = np.sqrt(dot(vectors, vectors))
+        length = np.sqrt(np.vecdot(vectors, vectors))
         covered = known[rows] & frame.covered & (length > 0)
         unit = np.where(covered[..., None], vectors, 0) / np.where(covered, length, 1)[..., None]
         yield rows, frame.express(unit) / 2 + 0.5, covered

@@ -119,7 +119,7 @@ def _result(a: Cloud, found: "_Matches", pose: np.ndarray) -> Fit:
     together = _together(found, system, BLOCK * float(np.median(a.spacing)))
     squared = max(found.ratio, 1.0) ** 2 * together**2
     local = found.placed - system.pivot
-    grow = _dots(local, found.normal)
+    grow = np.vecdot(local, found.normal)
     weight = found.weight / found.sigma**2
     cross = system.weighted.T @ grow
     try:
@@ -180,10 +180,6 @@ class _System(NamedTuple):
     weighted: np.ndarray
 
 
-def _dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return (one * other) @ np.ones(3)
-
-
 def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, search: NearestWithin, rows: slice) -> _Matches | None:
     sample = b.sample[rows]
     placed = applied(pose, b.points[sample])
@@ -191,24 +187,24 @@ def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, search: NearestWi
     near = np.flatnonzero(apart < reach)
     sample, placed, index, apart = sample[near], placed[near], index[near], apart[near]
     turned = b.normals[sample] @ pose[:3, :3].T
-    alike = _dots(turned, a.normals[index])
+    alike = np.vecdot(turned, a.normals[index])
     normal = turned + a.normals[index]
-    normal /= np.maximum(np.sqrt(_dots(normal, normal)), 1e-12)[:, None]
-    across = _dots(placed - a.points[index], normal)
+    normal /= np.maximum(np.sqrt(np.vecdot(normal, normal)), 1e-12)[:, None]
+    across = np.vecdot(placed - a.points[index], normal)
     beside = np.sqrt(np.maximum(apart**2 - across**2, 0))
     keep = (alike > ALIKE) & ~a.border[index] & ~b.border[sample] & (beside < 1.5 * a.spacing[index])
     if keep.sum() < LEAST_MATCHES:
         return None
     at, of, normal, across = index[keep], sample[keep], normal[keep], across[keep]
-    seen_b = _dots(b.directions[of] @ pose[:3, :3].T, normal) * b.sigma[of]
-    seen_a = _dots(a.directions[at], normal) * a.sigma[at]
+    seen_b = np.vecdot(b.directions[of] @ pose[:3, :3].T, normal) * b.sigma[of]
+    seen_a = np.vecdot(a.directions[at], normal) * a.sigma[at]
     sigma = np.sqrt(seen_a**2 + seen_b**2 + (0.05 * np.minimum(a.sigma[at], b.sigma[of])) ** 2)  # grazing rays: never 0
     ratio = MAD_TO_SIGMA * float(np.median(np.abs(across) / sigma))
     weight = tukey_weights(across, max(ratio, 1.0) * sigma)
     # 16 neighbours that lie about a spacing away tilt a plane by a quarter of σ over the spacing
     tilt = max(ratio, 1.0) * np.hypot(a.sigma[at] / a.spacing[at], b.sigma[of] / b.spacing[of]) / 4
     bent_a, bent_b = a.normals[at] - a.near_normals[at], b.normals[of] - b.near_normals[of]
-    bent = np.sqrt(_dots(bent_a, bent_a) + _dots(bent_b, bent_b))
+    bent = np.sqrt(np.vecdot(bent_a, bent_a) + np.vecdot(bent_b, bent_b))
     scale = MAD_TO_SIGMA * float(np.median(np.abs(across)))
     return _Matches(at, of, placed[keep], normal, across, sigma, weight, tilt, bent, scale, ratio, seen_a, seen_b)
 

@@ -73,7 +73,7 @@ def test_digits_that_are_not_resolved_are_left_out(tmp_path, light, base, reflec
 @first_short("inverses", [False, True])
 @first_short(("blur_px", "stripe_px"), [(4.0, 8), (0.4, 1)])
 def test_plain_bits_that_are_not_resolved_are_left_out(tmp_path, light, inverses, blur_px, stripe_px):
-    """Of bits that hardly a pixel reads the coarsest stays: it is wrong by a stripe at most, and σ is that of an edge then."""
+    """The coarsest of the bits that hardly a pixel reads stays: it is wrong by a stripe at most, and σ is that of an edge then."""
     found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light,
                         binary_patterns(320, "column", code="binary", inverses=inverses))
     assert (off > 5).mean() < 0.01 and len(off) > 0.95 * (light.lit & np.isfinite(light.depth)).sum()
