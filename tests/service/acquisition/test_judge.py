@@ -67,6 +67,7 @@ def test_the_highlight_of_a_glossy_ball_has_not_moved():
     assert named(scene, 1, ()) == ({}, {})
 
 
+@pytest.mark.long
 def test_a_lamp_that_a_plan_lights_twice_is_no_wrong_lamp():
     """Each of its pictures is nearer to the other than to all others; half of them were taken again, and named."""
     cap, directions = make_scene(size=48), fibonacci_sphere(64)
@@ -92,6 +93,7 @@ def test_lamps_in_front_of_a_matte_cap_without_texture_are_no_ambient_light():
     assert named(scene, 0, ())[1] == {}
 
 
+@pytest.mark.long
 def test_a_lamp_in_the_middle_of_a_ring_of_many_is_judged():
     """Its prediction rests on all of the ring alike, and on none by a twentieth."""
     around = 2 * np.pi * np.arange(40) / 40
@@ -120,8 +122,9 @@ def reviewed(scene: Scene, shots, picture_of, full_scale: float = FULL_SCALE) ->
     return at_once, {fault.shot: fault.kind for fault in judge.review()}
 
 
-@first_short("dark", [2, 0])
-@first_short("ambient", [0.0, 0.8])
+@pytest.mark.long
+@pytest.mark.parametrize("dark", [2, 0])
+@pytest.mark.parametrize("ambient", [0.0, 0.8])
 def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
     """In the dark, where pictures are noise, and in a room with its lights on, where all show the same; without a dark picture at
     once from where lamps at two heights are there, the first ring being of twelve."""

@@ -113,6 +113,7 @@ def test_what_is_at_rest_does_not_flicker_when_relit(relit, tmp_path):
     assert np.ptp(relative.mean(axis=1)) < NOISE / 10  # of all of them together: no pumping
 
 
+@pytest.mark.long
 def test_a_video_is_cut_into_steps(relit, tmp_path):
     source = shoot(tmp_path / "frames", GLIDING._replace(size=48), noise=0)
     frames = (rgb(source / f"take_{number}.exr")[..., ::-1] for number in range(PERIOD * STEPS + 1))

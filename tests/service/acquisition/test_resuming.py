@@ -196,6 +196,7 @@ def test_the_preview_shows_the_normals_of_the_capture(tmp_path):
     assert np.abs(shown[:64, :64][~scene.mask]).max() < 0.1  # the background
 
 
+@pytest.mark.long
 def test_an_exposure_that_changes_on_the_way_is_said_with_the_preview(tmp_path):
     """Half as much light under every other lamp of a ring, as where they are taken first, and the others after them."""
     scene = make_scene(size=64, lights=16)

@@ -13,6 +13,8 @@ from tests.reference.balls import lambertian, render
 from tests.scenes.captures import angles_degrees, files_in, write_lit
 from tests.service.calibrate.solvers.balls import spread
 
+pytestmark = pytest.mark.long
+
 WIDTH, HEIGHT = 320, 240
 PLACEHOLDER = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
 DIRECTIONS = spread(12, 0.15)
@@ -68,7 +70,6 @@ def measured(folder):
     return np.array([frame["light"]["direction"] for frame in frames])
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("camera", "hidden"), [("orthographic", False), ("orthographic", True), ("perspective", False)])
 def test_a_chrome_ball_is_found_and_gives_directions(tmp_path, camera, hidden):
     """Off the centre, among other round and bright things, half behind a book in one case, with noise."""
@@ -81,7 +82,6 @@ def test_a_chrome_ball_is_found_and_gives_directions(tmp_path, camera, hidden):
     assert len(error) >= 5 and error.max() < 0.5, error
 
 
-@pytest.mark.long
 def test_a_grey_ball_is_found_and_gives_directions(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0))
     grey_ball(GreyBallRequest(capture=folder, refine_direction=True))
@@ -89,7 +89,6 @@ def test_a_grey_ball_is_found_and_gives_directions(tmp_path):
     assert error.max() < 0.5, error
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("kind", "shade"), [("mirror", lambda d: lambertian(d, albedo=0.6, irradiance=2.0)), ("grey", chrome)])
 def test_a_ball_of_another_kind_is_refused(tmp_path, kind, shade):
     folder = photograph(tmp_path / "capture", "orthographic", shade)
@@ -102,7 +101,6 @@ def test_a_ball_of_another_kind_is_refused(tmp_path, kind, shade):
     assert files_in(folder) == before
 
 
-@pytest.mark.long
 def test_no_ball_is_refused(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", chrome, ball=False)
     with pytest.raises(RequestError, match="no mirror ball is found"):
@@ -140,7 +138,6 @@ def two_balls(folder, radii=(BALL_M, BALL_M)):
     return write_lit(folder, images, [PLACEHOLDER] * len(images), camera=camera)
 
 
-@pytest.mark.long
 def test_two_chrome_balls_are_found_and_give_positions(tmp_path):
     """A tenth of a pixel of outline or spot is 0.25°, 2 mm at 0.5 m; the rays meet at 20° to 30°, which doubles it and more."""
     folder = two_balls(tmp_path / "capture")
@@ -154,7 +151,6 @@ def test_two_chrome_balls_are_found_and_give_positions(tmp_path):
     assert (error < 3 * sigma).all()
 
 
-@pytest.mark.long
 def test_one_ball_does_not_place_lights(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", chrome)
     before = files_in(folder)
@@ -163,7 +159,6 @@ def test_one_ball_does_not_place_lights(tmp_path):
     assert files_in(folder) == before
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("widened", [1.08, 1.0, 1.15])
 def test_a_ball_whose_picture_is_an_ellipse_is_said_and_held(relit, tmp_path, widened):
     """As of images that were resized in one direction: its circle is 2.3 or 4.4 px off where the ellipse is farthest from it."""
@@ -176,8 +171,7 @@ def test_a_ball_whose_picture_is_an_ellipse_is_said_and_held(relit, tmp_path, wi
 
 
 @pytest.mark.parametrize(("camera", "kind", "circle"), [
-    ("orthographic", "mirror", "115.7,100.2,59"), pytest.param("orthographic", "mirror", "117,97,73", marks=pytest.mark.long),
-    pytest.param("perspective", "grey", "78.8,84.8,60.7", marks=pytest.mark.long)])
+    ("orthographic", "mirror", "115.7,100.2,59"), ("orthographic", "mirror", "117,97,73"), ("perspective", "grey", "78.8,84.8,60.7")])
 def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp_path, camera, kind, circle):
     shade = chrome if kind == "mirror" else lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0)
     folder = photograph(tmp_path / "capture", camera, shade)
@@ -194,11 +188,9 @@ def test_a_circle_that_lies_aside_is_named_with_the_one_that_is_there(relit, tmp
     assert json.loads((folder / "calibration.json").read_text())[f"{kind}-ball"]["warnings"] == []
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"moved_px": 4}, "px aside from 009.exr to 011.exr of where it lies from 000.exr to 002.exr"),
-    pytest.param({"camera": "perspective", "declared": {"projection": "orthographic"}}, "as a perspective camera sees it 13° off its axis",
-                 marks=pytest.mark.long)])
+    ({"camera": "perspective", "declared": {"projection": "orthographic"}}, "as a perspective camera sees it 13° off its axis")])
 def test_a_ball_that_moved_or_is_seen_from_aside_is_said_and_held(relit, tmp_path, changes, sentence):
     folder = photograph(tmp_path / "capture", **{"camera": "orthographic", **changes}, shade_of=chrome)
     outcome = relit.done("calibrate", "mirror-ball", folder)

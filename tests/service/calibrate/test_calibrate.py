@@ -9,6 +9,7 @@ import pytest
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.stack.correction import Correction
+from tests.marks import first_short
 from tests.reference.balls import lambertian, lambertian_near, mirror_of_far, mirror_of_near, render
 from tests.scenes.captures import (
     angles_degrees,
@@ -158,8 +159,8 @@ def test_grey_ball_writes_irradiance(relit, tmp_path):
     assert Capture.open(folder).manifest.irradiance_scale == "relative"
 
 
-@pytest.mark.parametrize("refined", [[], pytest.param(["--refine-direction"], marks=pytest.mark.long)])
-@pytest.mark.parametrize(("ambient", "said"), [(0.0, False), (0.001, False), (0.02, True)])
+@first_short("refined", [[], ["--refine-direction"]])
+@first_short(("ambient", "said"), [(0.02, True), (0.0, False), (0.001, False)])
 def test_light_of_the_room_is_told_by_the_dark_side_of_a_ball(relit, tmp_path, refined, ambient, said):
     """The brightest normals read 0.16 under the dimmest light: two hundredths are 12 % of that, and turn directions by degrees."""
     lights = [{**PLACEHOLDER, "direction": direction} for direction in DIRECTIONS.tolist()]

@@ -234,7 +234,7 @@ def pair():
     return left, stereo.visible_to(parts, left.points, stereo.POSE), [stereo.recorded(view.images[0], random) for view in (left, right)]
 
 
-@pytest.mark.parametrize("kind", ["one file", "two files", "JSON"])
+@first_short("kind", ["two files", "one file", "JSON"])
 def test_two_cameras(relit, tmp_path, pair, kind):
     """Two folders and what cv2.stereoCalibrate found: true depth in two commands, whatever the images are called."""
     left, visible, recorded = pair

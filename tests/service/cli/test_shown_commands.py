@@ -15,6 +15,8 @@ from tests.service.calibrate.solvers.test_chart_reference import cgats
 from tests.service.owl import write_small_owl
 from tests.stage.colour.test_configuration import minimal
 
+pytestmark = pytest.mark.long
+
 DOCS = Path(__file__).parents[3] / "docs"
 SMALL_SIDE = 8
 SQUARE = 60
@@ -39,7 +41,6 @@ def chart_at(corners: np.ndarray) -> np.ndarray:
     return np.maximum(picture + 0.002 * np.random.default_rng(1).normal(size=picture.shape), 0)
 
 
-@pytest.mark.long
 def test_the_commands_of_colour_run(relit, tmp_path, monkeypatch):
     commands = shown("colour.md")
     [corners] = [np.reshape([float(each) for each in words[words.index("--corners") + 1].split(",")], (4, 2))
@@ -62,7 +63,6 @@ def test_the_commands_of_colour_run(relit, tmp_path, monkeypatch):
     assert len(commands) == 9 and {"a.0001.exr", "a.0001.png", "sheet.png", "lights.png", "maps.exr", "chart.png"} <= made
 
 
-@pytest.mark.long
 def test_the_commands_of_publish_and_blender_run(relit, tmp_path, monkeypatch):
     write_small_owl(tmp_path / "samples" / "owl", SMALL_SIDE)
     monkeypatch.chdir(tmp_path)

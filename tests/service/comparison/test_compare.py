@@ -101,6 +101,7 @@ def test_σ_covers_the_deviations(tmp_path, part):
     assert reported(estimated)["sigma_source"] == "estimated" and "shared-sigma" in " ".join(estimated.warnings)
 
 
+@pytest.mark.long
 def test_a_datum_carries_the_scan(tmp_path, part):
     """The boss stands .05 mm too high: laid on the plate alone, all of it shows there; laid by all, the plate takes a part of it."""
     made, design = part

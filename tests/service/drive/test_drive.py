@@ -89,6 +89,7 @@ def test_normals_that_no_lamp_lights_have_no_colour(drive, tmp_path):
     assert report["irradiance_error"]["chromaticity_uv"]["largest"] < 0.01
 
 
+@pytest.mark.long
 def test_it_is_nearer_than_sampling_an_eight_bit_panorama_at_the_lamps(drive, tmp_path):
     directions = fibonacci_sphere(128)
     rig = write_rig(tmp_path / "rig.json", directions, irradiance=4.0, bits=8)

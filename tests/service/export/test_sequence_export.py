@@ -89,6 +89,7 @@ def test_each_time_code_shows_its_step(walk, tmp_path, suffix):
     assert UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", ["usdc", "usdz"])
 def test_validators_find_nothing(walk, scans, tmp_path, suffix):
     assert findings(exported(walk, tmp_path / f"walk.{suffix}").path) == []

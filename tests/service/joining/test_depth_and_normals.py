@@ -102,7 +102,8 @@ def test_normals_that_are_too_flat_or_too_steep_everywhere_get_the_relief_of_the
     assert degrees_between(joined.normal, WAVE.normal).mean() < 1.2  # 1.1° of noise and drift were given
 
 
-@first_short(("wrong", "said"), [(True, True), (False, False)], ids=["range along the ray", "depth along the axis"])
+@pytest.mark.long
+@pytest.mark.parametrize(("wrong", "said"), [(True, True), (False, False)], ids=["range along the ray", "depth along the axis"])
 def test_a_bent_depth_that_contradicts_the_normals_is_said_and_held(device, wrong, said):
     """A range along the ray bends the surface by 8° in the mean: 70 % of the heights were more than 5 σ off."""
     view = see("wave", perspective=True)

@@ -58,6 +58,7 @@ def test_lights_of_a_spiral_that_are_one_image_off_are_named(tmp_path):
         assert len(said) == 1 and "one image off" in said[0]
 
 
+@pytest.mark.long
 def test_lights_in_another_order_are_named(tmp_path):
     for said in declared(tmp_path / "capture", lambda directions: np.random.default_rng(0).permutation(directions)):
         assert len(said) == 1 and "images and directions do not belong together" in said[0]

@@ -40,6 +40,7 @@ def relight(relit, folder, out, *options):
     return rgb(out / "f.1.exr"), outcome.out
 
 
+@pytest.mark.long
 def test_bracketed_frames_give_the_frame_without_clipping(relit, capture):
     """The longest exposure comes first and is clipped at most pixels; to half rounding of images, sums and frames."""
     truth, _ = relight(relit, capture, capture / "a")

@@ -8,6 +8,8 @@ from tests.scenes.captures import rgb, write_exr
 from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 from tests.service.relight.test_clipping import relight
 
+pytestmark = pytest.mark.long
+
 SURFACE = dome(40)
 LIGHTS = cap(48, 45)
 SUN_DEGREES = 80
@@ -48,7 +50,6 @@ def scene(tmp_path_factory):
     return folder, sky(folder, SUN_DEGREES)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("wrong", ["nothing", "albedo", "normals"])
 def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp_path, wrong):
     """With an albedo that is off by half, a correction in radiance is off by as much and leaves black patches; shares are not. Normals of
@@ -65,7 +66,6 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
         assert (frame[lit].mean(axis=-1) > 0.5 * truth[lit].mean(axis=-1)).mean() > 0.99
 
 
-@pytest.mark.long
 def test_the_share_of_such_light_is_said(relit, scene, tmp_path):
     folder, _ = scene
     maps = write_maps(tmp_path / "maps", SURFACE)
@@ -78,7 +78,6 @@ def test_the_share_of_such_light_is_said(relit, scene, tmp_path):
         assert share == pytest.approx(100, abs=2)
 
 
-@pytest.mark.long
 def test_nothing_is_said_where_the_light_was_captured(relit, tmp_path):
     write_dome(tmp_path / "cap", SURFACE, directions=LIGHTS)
     sky(tmp_path, 25)

@@ -84,6 +84,7 @@ def test_diffuse_and_specular_add_up_to_the_beauty(relit, scene, tmp_path):
     assert specular[SURFACE.mask].mean() < 0.5 * truth[SURFACE.mask].mean()
 
 
+@pytest.mark.long
 def test_guided_frames_are_known_again(relit, scene, tmp_path):
     folder, _ = scene
     relight(relit, folder, tmp_path, "--maps", folder / "maps")

@@ -12,6 +12,8 @@ from tests.kernels.scenes import cap
 from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 
+pytestmark = pytest.mark.long
+
 SURFACE = dome()
 SUN = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
 LOW_SUN = np.array([0.9, 0.3, -0.1]) / np.linalg.norm([0.9, 0.3, -0.1])
@@ -22,7 +24,7 @@ HALF = 2.0**-10
 """Relative: two roundings to half."""
 
 
-@pytest.fixture(scope="module", params=["around", *(pytest.param(name, marks=pytest.mark.long) for name in ("in front", "perspective"))])
+@pytest.fixture(scope="module", params=["around", "in front", "perspective"])
 def scene(request, tmp_path_factory):
     """A capture under lights all around or in front, maps, and an environment with two suns in a sky of two colours. With perspective, the
     images are still those of parallel lines of sight, which a model that is only compared with itself does not mind."""
@@ -57,7 +59,6 @@ def keys(folder, **content):
     return "--keys", folder / "keys.json"
 
 
-@pytest.mark.long
 def test_frames_are_those_made_alone(relit, scene, tmp_path):
     """Under a turning and tilting environment, a small disc and a wide one, and a captured image. Alone, a frame takes the environment as
     1024 samples; in a range it is spread over a grid. Each is within a few parts in a thousand of very many samples."""
@@ -75,7 +76,6 @@ def test_frames_are_those_made_alone(relit, scene, tmp_path):
         assert not np.array_equal(together[number], alone)  # they are made in two ways
 
 
-@pytest.mark.long
 def test_the_specular_layer_is_that_of_a_frame_alone(relit, scene, tmp_path):
     relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--aov", "diffuse,specular")
     relight(relit, scene, tmp_path / "b", "--frames", "1", "--aov", "diffuse,specular")
@@ -83,7 +83,6 @@ def test_the_specular_layer_is_that_of_a_frame_alone(relit, scene, tmp_path):
     assert SURFACE.off(together, alone) < 0.002 and alone[SURFACE.mask].min() > 0
 
 
-@pytest.mark.long
 def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
     """To the rounding of its sine and cosine, and half."""
     options = keys(tmp_path, environment=[{"frame": 1, "turn_degrees": 0}, {"frame": FRAMES, "turn_degrees": 360}])
@@ -92,7 +91,6 @@ def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
     assert SURFACE.off(frames[3], frames[1]) > 0.1
 
 
-@pytest.mark.long
 def test_a_turn_is_a_picture_that_is_moved(relit, scene, tmp_path):
     """By 10 of 96 columns, two frames of five. The moved map is cut into other samples, which fall elsewhere on the grid."""
     spin = "--frames", "1-8", "--spin-degrees", "150"
@@ -115,7 +113,6 @@ def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
     assert SURFACE.off(together[1], truth) < 1.02 * SURFACE.off(alone[1], truth)
 
 
-@pytest.mark.long
 def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monkeypatch):
     """Batches of 128 pixels in portions of 32: to half and the order of float32 sums."""
     whole = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
@@ -126,7 +123,6 @@ def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monke
         np.testing.assert_allclose(parts[number], whole[number], rtol=2 * HALF, atol=1e-5)
 
 
-@pytest.mark.long
 def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tmp_path, monkeypatch):
     """With them, the frames are the same to half and the order of float32 sums."""
     asked = []
@@ -148,7 +144,6 @@ def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tm
         np.testing.assert_allclose(frames[number], every[number], rtol=2 * HALF, atol=1e-5)
 
 
-@pytest.mark.long
 def test_small_lights_of_few_frames_at_a_time_light_alike(relit, scene, tmp_path, monkeypatch):
     """The horizons of a perspective camera and of lights far apart differ where they are interpolated, at the edges of few shadows."""
     together = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--spin-degrees", "20")

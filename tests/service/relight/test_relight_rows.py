@@ -54,6 +54,7 @@ def test_files_written_in_rows_are_those_written_whole(run, request, tmp_path, o
     assert "skipped  3 of 4" in run("rows", *options).out
 
 
+@pytest.mark.long
 def test_parts_and_several_lights(run, request, tmp_path):
     options = ("--keys", tmp_path / "keys.json", "--aov", "lights,mask", "--parts", "multi")
     assert run("whole", *options).code == 0

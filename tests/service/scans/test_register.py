@@ -104,6 +104,7 @@ def test_a_scan_that_is_there_twice_counts_once(relit, tmp_path):
     assert "holds one scan" in refused and "s1: holds no points but those of s0" in refused
 
 
+@pytest.mark.long
 def test_poses_of_the_file_are_starts(relit, tmp_path):
     seen = views(figure, 0, 30, 60)
     rough = {}

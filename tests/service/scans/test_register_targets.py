@@ -87,7 +87,7 @@ def write_walls(folder, kind: str, *, images: bool = True):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "option"), [
-    ("aruco4", ("--markers", "aruco4")), pytest.param("board", ("--board", "7x6"), marks=pytest.mark.long)])
+    ("aruco4", ("--markers", "aruco4")), ("board", ("--board", "7x6"))])
 def test_a_flat_wall_is_placed_by_the_marks_that_its_images_show(relit, tmp_path, kind, option):
     folder = write_walls(tmp_path / "set", kind)
     relit.done("register", folder, "--out", tmp_path / "out", *option)

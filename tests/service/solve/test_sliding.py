@@ -48,6 +48,7 @@ def test_sigma_holds_what_a_slide_makes(tmp_path):
     assert np.quantile(solved(tmp_path, 4.0, lights=40, wide=0.5, method=Method.SVBRDF)[1], 0.95) < 2.5
 
 
-@first_short("wide", [0.5, 0.0])
+@pytest.mark.long
+@pytest.mark.parametrize("wide", [0.5, 0.0])
 def test_a_steady_object_is_not(tmp_path, wide):
     assert solved(tmp_path, 0.0, wide=wide)[0] == []

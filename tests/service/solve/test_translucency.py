@@ -6,9 +6,10 @@ import pytest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.formats import exr
-from tests.marks import first_short
 from tests.scenes.captures import write_image
 from tests.scenes.translucent import Body, write
+
+pytestmark = pytest.mark.long
 
 
 def solved(folder, body, method=Method.ROBUST, **scene):
@@ -21,9 +22,8 @@ def solved(folder, body, method=Method.ROBUST, **scene):
     return error[maps.mask] / maps.sigma[maps.mask], " ".join(result.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("lengths", "seed"), [((1.0, 0.7, 0.5), 1), ((2.1, 1.5, 1.05), 2), ((3.5, 2.5, 1.75), 3), ((5.0, 2.0, 1.0), 6)])
-@pytest.mark.parametrize("method", [Method.ROBUST, pytest.param(Method.SVBRDF, marks=pytest.mark.long)])
+@pytest.mark.parametrize("method", [Method.ROBUST, Method.SVBRDF])
 def test_normals_of_translucent_bodies_are_as_unsure_as_they_are_wrong(tmp_path, method, lengths, seed):
     """Without what shadows tell, 5 to 63 % of the normals are wrong by more than five σ."""
     ratio, said = solved(tmp_path, Body(lengths=lengths), method, seed=seed)
@@ -32,14 +32,13 @@ def test_normals_of_translucent_bodies_are_as_unsure_as_they_are_wrong(tmp_path,
     assert (ratio > 5).mean() < 0.02
 
 
-@first_short("body", [Body(), Body(lens_px=0.9), Body(bounced=(0.3, 0.2, 0.1)), Body(lens_px=0.6, bounced=(0.4, 0.2, 0.05))],
-                         ids=["sharp", "blurred by the lens", "in bounced light", "both"])
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.parametrize("body", [Body(), Body(lens_px=0.9), Body(bounced=(0.3, 0.2, 0.1)), Body(lens_px=0.6, bounced=(0.4, 0.2, 0.05))],
+                                     ids=["sharp", "blurred by the lens", "in bounced light", "both"])
+@pytest.mark.parametrize("seed", [4, 5])
 def test_opaque_bodies_are_not_taken_for_translucent_ones(tmp_path, body, seed):
     assert "translucent" not in solved(tmp_path, body, seed=seed)[1]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("body", "noise"), [(Body(albedo=(0.6, 0.2, 0.03)), 0.01),
                                              (Body(albedo=(0.6, 0.3, 0.08), bounced=(0.5, 0.3, 0.1)), 0.02)])
 def test_noise_makes_no_sharp_edges_of_the_darker_colour(tmp_path, body, noise):
@@ -47,7 +46,6 @@ def test_noise_makes_no_sharp_edges_of_the_darker_colour(tmp_path, body, noise):
     assert "translucent" not in solved(tmp_path, body, noise=noise, seed=1)[1]
 
 
-@pytest.mark.long
 def test_jpegs_are_not_judged(tmp_path):
     """Their colours are stored at half the resolution, and dark ones coarsely."""
     body = Body(albedo=(0.6, 0.3, 0.08), lengths=(1.0, 0.7, 0.5))

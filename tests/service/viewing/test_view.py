@@ -17,6 +17,7 @@ from service.viewing.view_files import view
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
+from tests.marks import first_short
 from tests.reference.view import View
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.glossy import dome, write_dome, write_maps
@@ -87,7 +88,7 @@ def test_patterns_have_frames_and_nothing_to_relight(relit, tmp_path):
 
 
 @pytest.mark.parametrize("lights", [1, 4])
-@pytest.mark.parametrize("mask", ["mask.png", None])
+@first_short("mask", ["mask.png", None])
 def test_few_lights_with_and_without_a_mask(relit, tmp_path, lights, mask):
     write_capture(tmp_path / "cap", make_scene(lights=lights), mask=mask)
     assert relit("view", tmp_path / "cap", "--out", tmp_path / "out").code == 0

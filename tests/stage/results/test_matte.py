@@ -83,6 +83,7 @@ def test_an_object_out_of_focus_has_a_wide_border(tmp_path, blur_px):
     assert edge_error(scene, matte.coverage) < 0.05 * blur_px**0.5 < edge_error(scene, np.float32(scene.coverage > 0.5))
 
 
+@pytest.mark.long
 def test_a_lit_wall_with_moving_shadows_is_kept(tmp_path):
     """The mask cannot be softened, and a picture of the whole is whole."""
     matte = found(tmp_path, render_covered(background=0.4))
@@ -131,6 +132,7 @@ def test_partial_values_without_a_pixel_of_the_background_alone(tmp_path, backgr
     assert np.allclose(matte.factor, 1 if background == 0 else coverage, atol=1e-4)
 
 
+@pytest.mark.long
 def test_images_that_are_cut_along_the_mask_keep_their_whole_border(tmp_path):
     scene = render_covered()
     whole = cv2.erode(np.uint8(scene.coverage == 1), np.ones((3, 3))) > 0
@@ -138,7 +140,7 @@ def test_images_that_are_cut_along_the_mask_keep_their_whole_border(tmp_path):
     assert matte.source is MatteSource.MASK and matte.hard == 0 and np.array_equal(matte.coverage, whole)
 
 
-@pytest.mark.parametrize("change", ["few lights", "a thin rod"])
+@first_short("change", ["few lights", "a thin rod"])
 def test_what_the_images_do_not_show_stays_hard(tmp_path, change):
     scene = render_covered(lights=5) if change == "few lights" else render_covered(radii=(0.9, 0.02))
     matte = found(tmp_path, scene)

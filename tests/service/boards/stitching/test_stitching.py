@@ -133,6 +133,7 @@ def test_tiles_that_do_not_fit_are_one_sentence(change, words):
         stitch(points(change(views)))
 
 
+@pytest.mark.long
 def test_a_tile_far_from_where_the_stage_says_is_found_and_told():
     """35 pixels away, where the stage is said to be exact to 5: all overlaps agree about it, so that it is used, with a warning."""
     views = views_of(domes(4e-3, 4e-3, seed=2))

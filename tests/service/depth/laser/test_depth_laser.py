@@ -195,6 +195,7 @@ def test_a_camera_that_moves_during_a_sweep_is_named_and_sigma_holds_it(relit, t
         assert (np.abs(maps.depth - scene.depth) > 5 * maps.sigma)[maps.mask].mean() < 0.005
 
 
+@pytest.mark.long
 def test_a_second_plane_in_every_frame_is_told(relit, tmp_path):
     planes, others = ([plane(x + step) for x in np.linspace(-0.08, 0.08, 12)] for step in (0.0, 0.05))
     write_lasers(tmp_path, SCENE, planes, width=1.2e-3, noise=0.003, camera=CAMERA, undeclared=others, strength=0.6)

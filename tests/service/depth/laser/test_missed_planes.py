@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.trials.laser import Case, cloth, grain, swept
-from tests.marks import first_short
+
+pytestmark = pytest.mark.long
 
 WORDS = "frames are missing, doubled or in another order"
 
 
-@first_short(("slipped", "texture", "words"), [
+@pytest.mark.parametrize(("slipped", "texture", "words"), [
     ((25, 60), cloth, "from 024.exr to 025.exr the stripe does not move"), ((25, 26), grain, "and 1 more such steps"),
     ((40, 60), grain, "from 039.exr to 040.exr the stripe does not move")])
 def test_frames_that_are_out_of_step_are_as_unsure_as_they_are_wrong(slipped, texture, words):
@@ -20,7 +21,6 @@ def test_frames_that_are_out_of_step_are_as_unsure_as_they_are_wrong(slipped, te
     assert found.solved.mean() > 0.2 and (ratio > 5).mean() < 0.02
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("case", [Case("right", grain, planes=40), Case("a second plane", grain, planes=60, second=0.2, second_every=5),
                                   Case("the camera drifts", cloth, planes=60, drift_px=2.0)], ids=lambda case: case.name)
 def test_sweeps_in_step_are_not_accused(case):

@@ -70,8 +70,9 @@ def test_digits_that_are_not_resolved_are_left_out(tmp_path, light, base, reflec
     assert all(f"stripes are {base**digits} px wide" in warning for warning in said)
 
 
-@first_short("inverses", [False, True])
-@first_short(("blur_px", "stripe_px"), [(4.0, 8), (0.4, 1)])
+@pytest.mark.long
+@pytest.mark.parametrize("inverses", [False, True])
+@pytest.mark.parametrize(("blur_px", "stripe_px"), [(4.0, 8), (0.4, 1)])
 def test_plain_bits_that_are_not_resolved_are_left_out(tmp_path, light, inverses, blur_px, stripe_px):
     """The coarsest of the bits that hardly a pixel reads stays: it is wrong by a stripe at most, and σ is that of an edge then."""
     found, off = solved(tmp_path, World(shapes=SHAPES, blur_px=blur_px), light,

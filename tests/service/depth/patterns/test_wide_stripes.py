@@ -9,6 +9,8 @@ from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import phase_patterns
 from tests.scenes.depth import depth_of
 
+pytestmark = pytest.mark.long
+
 SHAPES = (Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.4), Ball((0.12, -0.05, -1.2), 0.16, 0.8))
 RIGS = {axis: Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0, position_m=position)
         for axis, position in (("column", (-0.22, 0.03, 0.0)), ("row", (0.03, -0.22, 0.0)))}
@@ -24,7 +26,6 @@ def solve(folder, world, light, axis, stripe, *, inverses=True):
     return depth_of(folder)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("axis", "blur"), [("column", 2.0), ("row", 0.4)])
 def test_edges_number_the_periods(tmp_path, axis, blur):
     world = World(shapes=SHAPES, rig=RIGS[axis], blur_px=blur)
@@ -41,7 +42,6 @@ def test_edges_number_the_periods(tmp_path, axis, blur):
         assert (np.abs(maps.depth - light.depth) > WRONG_M)[maps.mask].mean() < 0.005
 
 
-@pytest.mark.long
 def test_without_inverses_places_near_an_edge_stay_undecided(tmp_path):
     world = World(shapes=SHAPES, rig=RIGS["column"])
     light = trace(world)

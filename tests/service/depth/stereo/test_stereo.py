@@ -235,7 +235,8 @@ def test_images_without_texture_are_refused_with_a_sentence(relit, tmp_path):
     relit("depth", scenes.write_pair(tmp_path, blank[:1], blank[1:]), "--out", tmp_path / "out").refused("show no texture that both see")
 
 
-@pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.long), True])
+@pytest.mark.long
+@pytest.mark.parametrize("mirrored", [False, True])
 def test_images_of_other_moments_give_no_depth(relit, tmp_path, mirrored):
     """One pixel in a hundred matches by chance, where the range of depths is given."""
     left, right, _ = seen("plane and sphere")

@@ -94,8 +94,8 @@ def test_what_the_second_camera_does_not_see_has_no_depth(relit, tmp_path):
     assert wrong.sum() <= 0.02 * hidden.sum()
 
 
-@pytest.mark.parametrize("degrees", [
-    (0.5, 0, 0), *(pytest.param(more, marks=pytest.mark.long) for more in ((0, 0.1, 0), (0, 0, 0.5), (0, 2, 0)))])
+@pytest.mark.long
+@pytest.mark.parametrize("degrees", [(0.5, 0, 0), (0, 0.1, 0), (0, 0, 0.5), (0, 2, 0)])
 def test_a_wrong_pose_is_named_and_sigma_holds_it(relit, tmp_path, degrees):
     first = two_captures(tmp_path, 0.004)
     camera = json.loads((tmp_path / "second" / "capture.json").read_text())["camera"]

@@ -124,7 +124,8 @@ def arc(folder, poses=None):
     return write_scans(folder, shots, poses=[poses(first @ shot.world_from_camera) for shot in shots])
 
 
-@pytest.mark.parametrize("moved_m", [pytest.param(0.0, marks=pytest.mark.long), 1.0])
+@pytest.mark.long
+@pytest.mark.parametrize("moved_m", [0.0, 1.0])
 def test_inverted_poses_are_named_so(tmp_path, moved_m):
     """About a round body most of the surface fits all the same; with the world beside it nothing does."""
     file = arc(tmp_path, lambda pose: np.linalg.inv(pose + moved_m * np.outer(np.eye(4)[0], np.eye(4)[3])))

@@ -225,6 +225,7 @@ def test_no_pose_of_bodies_that_look_alike_is_wrong(body):
         assert np.degrees(np.linalg.norm(wrong[:3])) < 1, angle
 
 
+@pytest.mark.long
 def test_what_a_start_places_is_not_named():
     views = seen(urn, 0, 20, rows=80)
     scans = [scan_of(view) for view in views]

@@ -129,6 +129,7 @@ def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_h
     assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
 
 
+@pytest.mark.long
 @ON_SQLITE
 def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness, uploaded, monkeypatch):
     identifier, names = uploaded

@@ -8,6 +8,8 @@ from tests.service.server.pages.conftest import SAMPLES, done, keep, new_context
 from tests.service.server.pages.frames import assert_same, picture, rendered
 from tests.service.server.pages.photographs import write_photographs
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def shown(server, material, sky) -> dict[str, str]:
@@ -34,7 +36,6 @@ CONTENT = {"captures": "#captures a", "jobs": "#jobs tbody a", "job": "#stages t
            "proposal": ".proposal button"}
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_page_shows_the_sample(browser, server, shown, sky, tmp_path, scheme):
     context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 860}, color_scheme=scheme)
@@ -60,7 +61,6 @@ def test_every_page_shows_the_sample(browser, server, shown, sky, tmp_path, sche
     context.close()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.75, 0.3), (0.3, 0.8)])
 def test_the_light_dragged_over_the_sample_shows_what_the_batch_renders(page, owl, tmp_path, place):
     """The sample has highlights and shadows as sharp as its pixels, and the light is as small as the sun."""

@@ -28,7 +28,7 @@ def solved(relit, folder, *options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("radii", "count"), [(3.0, 8), pytest.param(1.5, 16, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("radii", "count"), [(3.0, 8), (1.5, 16)])
 def test_the_distance_is_found(relit, tmp_path, radii, count):
     """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""
     out, report, maps = solved(relit, capture(tmp_path / "c", lamps(DOME, count, radii)))

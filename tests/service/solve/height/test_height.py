@@ -52,6 +52,7 @@ def test_metal_by_robust_is_unsure_has_no_spikes_and_says_so(tmp_path):
     assert report["warnings"] == list(result.warnings)
 
 
+@pytest.mark.long
 def test_a_matt_surface_has_no_such_warning(tmp_path):
     folder = captures.write_capture(tmp_path / "capture", captures.make_scene(size=24, lights=12))
     for method in (Method.LAMBERT, Method.ROBUST):

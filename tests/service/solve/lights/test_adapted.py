@@ -34,6 +34,7 @@ def test_only_adapted_images_are_mended_by_a_power_of_the_brightness_around(tmp_
     assert (find_adapted(sample, places) is not None) == found
 
 
+@pytest.mark.long
 def test_adapted_images_are_said_and_held_by_sigma(tmp_path):
     """Lights of other strengths explain them as well, by normals that are 7° off; they were 6 σ off, and 59 % of them more than 5 σ."""
     truth = write(tmp_path, replace(FIELD, adapted=True), 4)

@@ -7,7 +7,6 @@ import pytest
 
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
-from tests.marks import first_short
 from tests.scenes import bowl, near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr
 from tests.scenes.near_lights import Lamp, far, lamps
@@ -181,7 +180,8 @@ def test_relight_takes_near_lights_as_the_centre_sees_them_and_says_so(relit, tm
         assert np.allclose(frames["near"][channel], frames["far"][channel], rtol=2e-3, atol=1e-5)
 
 
-@first_short("dome", [ORTHOGRAPHIC, PERSPECTIVE], ids=["orthographic", "perspective"])
+@pytest.mark.long
+@pytest.mark.parametrize("dome", [ORTHOGRAPHIC, PERSPECTIVE], ids=["orthographic", "perspective"])
 def test_a_part_of_the_images_is_solved_as_in_the_whole(relit, tmp_path, dome):
     """Lights stay where they are in the camera frame: the rays of the part and its distance are those of the whole."""
     near_lights.write(tmp_path, dome, lamps(dome, 12, 2.0))
