@@ -8,8 +8,10 @@ from kernels import packs
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.model.misfit import Misfit, standard_error
+from tests.reference.sampling import lattice
 
 GREY = (0.2126, 0.7152, 0.0722)
+cap = lattice
 HALF_ROUNDING = 2.0**-11
 """Largest relative error of a half value."""
 HALF_STEP = 2.0**-25
@@ -31,15 +33,6 @@ class Solved(NamedTuple):
     def sigma(self, misfit: Misfit = Misfit()) -> np.ndarray:  # noqa: B008  (immutable)
         """Return the standard error of the normals in degrees, [pixel]."""
         return standard_error(self.across, self.squares, self.freedom, self.spare, self.agreeing, misfit)
-
-
-def cap(count: int, largest_degrees: float) -> np.ndarray:
-    """[count, 3]: an even lattice on the cap around +z; 180 degrees is the whole sphere."""
-    i = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(largest_degrees))) * i / count
-    azimuth = np.pi * (1 + 5**0.5) * i
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
 
 def colours(count: int, channels: int = 3, seed: int = 0) -> np.ndarray:

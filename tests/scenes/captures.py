@@ -206,3 +206,7 @@ def angles_degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between unit vectors along the last axis, without the loss of arccos near 0."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values.astype(np.float64) ** 2)))

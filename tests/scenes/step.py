@@ -7,6 +7,7 @@ import numpy as np
 from tests.reference import projector as reference
 from tests.scenes.captures import write_images, write_manifest
 from tests.scenes.depth import entry_of
+from tests.scenes.in_front import unit
 
 CAMERA = reference.Device(480, 360, 480.0, (-0.05, 0.02, 0.0), (0.001, -0.001))
 HEIGHT = 0.05
@@ -14,10 +15,6 @@ LASER = np.array((0.3, 0.08, 0.0))
 WIDTH = 0.0012
 """Standard deviation of the stripe, metres: 1 px."""
 PLACEHOLDER = {"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}
-
-
-def unit(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def laser_planes(count: int = 8, spread: float = 26.0) -> list[np.ndarray]:

@@ -1,5 +1,7 @@
 """Pictures are judged as they come; the shots of a plan."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -137,22 +139,14 @@ def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("gain", [1.0, 0.004])
-def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
-    """As float images have them whose full scale is any number."""
-    scene, random = relief(1), np.random.default_rng(1)
+@pytest.mark.parametrize(("made", "gain"), [(partial(relief, 1), 1.0), (partial(relief, 1), 0.004), (owl, 1.0)])
+def test_a_capture_without_a_dark_picture_has_no_fault(made, gain):
+    """Also of small values, as float images have them whose full scale is any number; and of the owl, round which lamps spiral, so that
+    those taken so far stand on one side of the next, and grazing light predicts little."""
+    scene, random = made(), np.random.default_rng(1)
     shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
     shape = scene.radiance[0].shape
     assert reviewed(scene, shots, lambda shot: gain * (scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape))) == (set(), {})
-
-
-@pytest.mark.long
-def test_no_picture_of_the_owl_is_suspected_while_its_neighbours_are_not_there():
-    """Lamps spiral round the owl, so that those taken so far stand on one side of the next, and grazing light predicts little."""
-    scene, random = owl(), np.random.default_rng(1)
-    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
-    shape = scene.radiance[0].shape
-    assert reviewed(scene, shots, lambda shot: scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape)) == (set(), {})
 
 
 @first_short(("exposure", "kind"), [(0.1, FaultKind.BRIGHT), (0.4, FaultKind.CLIPPED)])

@@ -13,6 +13,7 @@ import service
 from stage.formats import exr
 from tests.marks import first_short
 from tests.reference.light_basis import relative_rms, render_ptm, render_rti, srgb, truncation
+from tests.reference.sampling import lattice
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, render, write_capture, write_exr
 
 SCENE = make_scene(size=16, lights=9)
@@ -24,9 +25,7 @@ AP1_TO_REC709 = np.array([[1.7050510, -0.6217921, -0.0832589], [-0.1302564, 1.14
 
 def dome(count: int) -> np.ndarray:
     """[count, 3] unit directions spread over the hemisphere."""
-    i = np.arange(count) + 0.5
-    z, turn = 1 - 0.9 * i / count, np.pi * (1 + 5**0.5) * i
-    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    return lattice(count, np.degrees(np.arccos(0.1)))
 
 
 def write_dome(folder: Path, directions: np.ndarray, **changes) -> np.ndarray:

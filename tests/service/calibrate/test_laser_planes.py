@@ -13,16 +13,13 @@ from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_images, write_manifest
 from tests.scenes.depth import entry_of
+from tests.scenes.in_front import unit
 from tests.service.calibrate.solvers.test_procam import BOARD, CAMERA, SQUARE, board_image, poses
 
 PLANES = [(np.array((0.25, 0.0, 0.0)), np.array((np.cos(angle), 0.05, np.sin(angle)))) for angle in np.radians((-13, -15.5, -18))]
 WIDTH = 0.0025
 PLACEHOLDER = {"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}
 POSES = list(islice(poses(8), 4))
-
-
-def unit(vector):
-    return vector / np.linalg.norm(vector)
 
 
 def photograph(folder, points, albedo, planes=PLANES, noise=0.002):

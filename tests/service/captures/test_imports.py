@@ -10,11 +10,7 @@ from service.captures.info import front_lights
 from stage.capture.capture import Capture
 from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
-from tests.scenes.captures import make_scene, render, write_exr, write_image
-
-
-def degrees_between(a, b):
-    return np.degrees(np.arccos(np.clip(np.sum(a * b, axis=-1), -1, 1)))
+from tests.scenes.captures import angles_degrees, make_scene, render, write_exr, write_image
 
 
 def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path):
@@ -30,7 +26,7 @@ def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path)
     assert outcome.code == 0 and f"capture  {folder}/capture.json" in outcome.out and "handed" in outcome.out
     assert relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").code == 0
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
-    assert degrees_between(maps.normal, scene.normal)[scene.mask].max() < 0.1  # half rounding of the stack
+    assert angles_degrees(maps.normal, scene.normal)[scene.mask].max() < 0.1  # half rounding of the stack
 
 
 @pytest.mark.parametrize("layout", ["lp", pytest.param("olat", marks=pytest.mark.long)])
@@ -113,7 +109,7 @@ def test_leds_in_the_layout_of_near_ps_give_the_true_height(relit, tmp_path):
     solved = maps.mask & dome.mask
     assert solved.sum() > 0.95 * dome.mask.sum()
     assert np.abs(maps.height - dome.points[..., 2])[solved].max() < 0.01 * dome.relief  # as the capture in relit's own layout is held to
-    assert degrees_between(maps.normal, dome.normal)[solved].max() < 0.5  # 16-bit readings minus ambient light
+    assert angles_degrees(maps.normal, dome.normal)[solved].max() < 0.5  # 16-bit readings minus ambient light
 
 
 @pytest.mark.long
@@ -139,7 +135,7 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     assert np.isclose(capture.camera.pixel_size_m, 0.002) and len(capture.manifest.frames) == 8
     assert relit("solve", tmp_path / "photos", "--out", tmp_path / "maps", "--method", "robust").code == 0
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
-    assert degrees_between(maps.normal, scene.normal)[scene.mask & maps.mask].max() < 0.1
+    assert angles_degrees(maps.normal, scene.normal)[scene.mask & maps.mask].max() < 0.1
     assert maps.mask.sum() > 0.9 * scene.mask.sum()
 
 

@@ -12,6 +12,7 @@ from service.requests.basis import BasisRequest
 from service.requests.captures import InfoRequest
 from service.requests.relight import RelightRequest
 from tests.marks import first_short
+from tests.reference.sampling import lattice
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture, write_exr
 from tests.scenes.ellipsoid import ellipsoid
 
@@ -66,10 +67,7 @@ def test_lights_in_another_order_are_named(tmp_path):
 
 def test_light_that_is_on_in_all_images_is_named(tmp_path):
     """Light from above, of half a lamp: other directions than the declared ones explain it as well."""
-    number = np.arange(24) + 0.5
-    z, turn = 1 - 0.75 * number / 24, np.pi * (1 + 5**0.5) * number
-    around = np.sqrt(1 - z**2)
-    scene = SCENE._replace(directions=np.stack([around * np.cos(turn), around * np.sin(turn), z], axis=1), irradiance=np.ones((24, 3)))
+    scene = SCENE._replace(directions=lattice(24, np.degrees(np.arccos(0.25))), irradiance=np.ones((24, 3)))
     images = render(scene.normal, scene.albedo, scene.directions, scene.irradiance)
     room = 0.5 / np.pi * scene.albedo * (0.5 + 0.5 * scene.normal[..., 1:2])
     for said in declared(tmp_path / "room", lambda directions: directions, scene._replace(images=images + room)):

@@ -15,7 +15,7 @@ from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.scenes import depth as depths
-from tests.scenes.captures import angles_degrees, edit_manifest, files_in
+from tests.scenes.captures import angles_degrees, edit_manifest, files_in, rms
 from tests.scenes.sequence import LIGHTS, SIZE, moment, write_sequence, write_step
 
 STEPS, NOISE = 7, 0.02
@@ -29,10 +29,6 @@ def maps_of(out, step):
 
 def request(folder, **options):
     return SolveRequest(capture=folder / "in", out=folder / "out", method=options.pop("method", Method.ROBUST), device="cpu", **options)
-
-
-def rms(values):
-    return float(np.sqrt((values.astype(float) ** 2).mean()))
 
 
 def grown(where, pixels):

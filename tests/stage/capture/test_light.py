@@ -78,11 +78,11 @@ def distant(direction) -> dict:
     return {"type": "distant", "direction": list(map(float, direction)), "irradiance": [2.0, 2.0, 2.0]}
 
 
-def capture_of(folder, *lights) -> Capture:
+def capture_of(folder, *lights, size: int = 2) -> Capture:
     for index in range(len(lights)):
-        write_exr(folder / f"{index}.exr", np.full((2, 2, 3), 0.5))
+        write_exr(folder / f"{index}.exr", np.full((size, size, 3), 0.5))
     write_manifest(folder, {"schema": "relit.capture/1", "name": "e",
-                            "camera": {"projection": "orthographic", "resolution": [2, 2]},
+                            "camera": {"projection": "orthographic", "resolution": [size, size]},
                             "frames": [{"image": f"{i}.exr", "light": light} for i, light in enumerate(lights)]})
     return Capture.open(folder)
 

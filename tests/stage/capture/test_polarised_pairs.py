@@ -13,8 +13,9 @@ from stage.capture.polarised_pairs import Component
 from stage.errors import ManifestError
 from stage.stack.brackets import merge_brackets, one_frame_a_light
 from stage.stack.ingest import open_stack
-from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr
 from tests.scenes.polarised import PEDESTAL, polarised_scene, write_polarised
+from tests.stage.capture.test_light import capture_of
 from tests.stage.stack.test_correction import radiance
 
 SCENE = polarised_scene(size=24, lights=12)
@@ -126,15 +127,6 @@ def test_polarised_placeholders_are_placeholders(tmp_path):
 
 def gradient(axis: str, sign: int = 1, polarization: str = "none") -> dict:
     return {"type": "gradient", "axis": axis, "sign": sign, "polarization": polarization}
-
-
-def capture_of(folder, *lights, size: int = 2) -> Capture:
-    for index in range(len(lights)):
-        write_exr(folder / f"{index}.exr", np.full((size, size, 3), 0.5))
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "g",
-                            "camera": {"projection": "orthographic", "resolution": [size, size]},
-                            "frames": [{"image": f"{i}.exr", "light": light} for i, light in enumerate(lights)]})
-    return Capture.open(folder)
 
 
 def test_rows_are_mean_and_dipole_in_the_order_of_the_stack(tmp_path):

@@ -124,20 +124,15 @@ def test_no_light():
             find_spot(image, None, ball, view)
 
 
-def test_a_spot_that_drowns_the_ball():
+@pytest.mark.parametrize(("light", "words"), [
+    (mirror_of_far(unit(0, 0, 1), degrees=60, floor=0.001), r"covers \d+% of the ball|no bright spot"),
+    (mirror_of_far(unit(0.3, 0, 1), degrees=25), r"covers \d+% of the ball: shorten the exposure"),
+    (mirror_of_far(unit(0.25, 0, -1), degrees=4), "at the rim of the ball"),
+], ids=["drowned", "large", "behind the object"])
+def test_a_spot_that_tells_no_direction(light, words):
     ball, view, geometry = exact("orthographic")
-    image, _ = seen(mirror_of_far(unit(0, 0, 1), degrees=60, floor=0.001), geometry)
-    with pytest.raises(CalibrationError, match=r"covers \d+% of the ball|no bright spot"):
-        find_spot(box(image, view), None, ball, view)
-    image, _ = seen(mirror_of_far(unit(0.3, 0, 1), degrees=25), geometry)
-    with pytest.raises(CalibrationError, match=r"covers \d+% of the ball: shorten the exposure"):
-        find_spot(box(image, view), None, ball, view)
-
-
-def test_a_light_behind_the_object():
-    ball, view, geometry = exact("orthographic")
-    image, _ = seen(mirror_of_far(unit(0.25, 0, -1), degrees=4), geometry)
-    with pytest.raises(CalibrationError, match="at the rim of the ball"):
+    image, _ = seen(light, geometry)
+    with pytest.raises(CalibrationError, match=words):
         find_spot(box(image, view), None, ball, view)
 
 

@@ -5,6 +5,7 @@ from scipy.spatial import ConvexHull
 from service.relight.weights.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
 from tests.kernels.scenes import cap
+from tests.scenes.in_front import unit
 
 LAYOUTS = {
     "tetrahedron": CUBE[[0, 3, 5, 6]], "octahedron": AXES, "cube": CUBE, "icosahedron": icosahedron(), "dodecahedron": dodecahedron(),
@@ -16,10 +17,6 @@ LAYOUTS = {
     "any": scattered(300, 4), "any five": scattered(5, 0),
 }
 """Regular ones, so that many lights lie on one circle; ones with holes; and ones on one side."""
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def planes(corners):

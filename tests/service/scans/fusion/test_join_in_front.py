@@ -8,6 +8,7 @@ from service.scans.fusion.fuse import FuseResult
 from service.scans.points.ply_points import read_ply_points
 from stage.results.maps import SurfaceMaps
 from tests.kernels.scenes import angle_degrees
+from tests.scenes.captures import rms
 from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit, with_dead_pixels
 from tests.scenes.register import fuse_scans
 from tests.scenes.statue import Shot, write_scans
@@ -37,10 +38,6 @@ def disc(flipped):
     for each in maps:
         each.normal[flipped][..., 0] *= -1
     return shots, maps
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 @pytest.mark.parametrize(("name", "sigma"), NOISE)

@@ -5,6 +5,7 @@ import pytest
 
 from service.scans.fusion.holes import area_vectors
 from service.scans.fusion.joined_normals import join_normals
+from tests.scenes.captures import rms
 from tests.service.scans.mesh_files import lattice_faces
 
 PIXEL, COUNT, SIGMA = 2e-3, 60, 1e-3
@@ -27,10 +28,6 @@ def degrees(points, faces):
     area = area_vectors(points, faces)
     unit = area / np.linalg.norm(area, axis=1, keepdims=True)
     return np.degrees(2 * np.arcsin(np.linalg.norm(unit - normals_at(points[faces].mean(axis=1)), axis=1) / 2))
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def sheet(thin):

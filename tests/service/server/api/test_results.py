@@ -280,16 +280,6 @@ def test_names_with_tricks_never_reach_the_storage(tmp_path):
         assert {name: status(name) for name in TRICKS} == dict.fromkeys(TRICKS, 404)
 
 
-@given(st.integers(0, 120), st.integers(0, 120), st.integers(0, 100))
-def test_a_range_is_cut_to_the_file(start, beyond, size):
-    file = OpenFile("x.bin", 0, size, 0.0, "a")
-    if start < size:
-        assert _part(f"bytes={start}-{start + beyond}", file) == range(start, min(start + beyond + 1, size))
-    else:
-        with pytest.raises(ApiError):
-            _part(f"bytes={start}-{start + beyond}", file)
-
-
 @pytest.mark.long
 @given(st.text())
 def test_any_range_and_any_tag_can_be_said(text):

@@ -8,7 +8,6 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from service.requests.keys import Scope
-from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import await_whole, expect, keep, new_context, seen
 from tests.service.server_process import serving
 
@@ -210,18 +209,6 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
     await_picture(page, sky)
     card.get_by_role("link").press("Enter")
     page.wait_for_url(re.compile(f"/{solved.capture}(#|$)"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("width", [1280, 640, 390])  # 640: as at 200 %
-def test_the_wall_fits_and_has_no_violation(browser, server, solved, sky, width):
-    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": width, "height": 844}).new_page()
-    page.goto("/")
-    await_picture(page, solved.capture)
-    await_whole(page)
-    page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
-    assert violations_in_both_schemes(page) == []
-    page.close()
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ from service.solve.height.integrability import LARGEST_TRACE, MIXED, MIXED_DEGRE
 from service.solve.solve import solve
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
+from tests.reference.sampling import lattice
 from tests.scenes import captures
 
 SHARPNESS = 12
@@ -22,9 +23,7 @@ SHARPNESS = 12
 def metal_cap(folder, lights=24):
     """A cap that reflects as metal does (Blinn), on which no reading is Lambertian."""
     scene = captures.make_scene(size=40, lights=2)
-    i = np.arange(lights) + 0.5
-    z, turn = 1 - 0.7 * i / lights, np.pi * (1 + 5**0.5) * i
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    directions = lattice(lights, np.degrees(np.arccos(0.3)))
     half = directions + [0, 0, 1]
     half /= np.linalg.norm(half, axis=1)[:, None]
     lobe = np.maximum(np.einsum("rcx,lx->lrc", scene.normal, half), 0) ** SHARPNESS
