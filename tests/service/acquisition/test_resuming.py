@@ -234,6 +234,7 @@ def test_a_step_that_fails_keeps_the_capture_and_says_one_command(tmp_path, stag
     assert (tmp_path / "capture" / "asset.usdz").exists()
 
 
+@pytest.mark.long
 def test_a_view_that_is_given_later_makes_the_preview_anew(tmp_path, stage, relit):
     path = tmp_path / "capture" / PREVIEW_FILE
     with controller(tmp_path, stage) as (rig, _):

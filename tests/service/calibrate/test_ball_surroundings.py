@@ -84,6 +84,7 @@ def test_two_lamps_alike_are_as_unsure_as_they_differ(tmp_path):
     assert np.delete(errors, 1).max() < 1.0 and np.delete(sure_to, 1).max() < 10
 
 
+@pytest.mark.long
 def test_what_mirrors_the_lamp_beside_it_is_held_by_sigma(tmp_path):
     """A wall of 12° beside the third lamp, a third as bright, runs into its spot."""
     images = [image((lamp(d),)) for d in DIRECTIONS]

@@ -12,7 +12,6 @@ from service.comparison.placing import Placement
 from service.comparison.surfaces import read_design, read_scanned
 from service.requests.register import Alignment, CompareRequest, FuseRequest
 from service.scans.fusion.fuse import fuse
-from tests.marks import first_short
 from tests.scenes.machined_part import SIGMA_M, Part, Scanned, machined_part, scan_of, write_scan, write_stl
 from tests.scenes.statue import turntable, write_scans
 
@@ -58,7 +57,8 @@ def test_a_mesh_without_any_noise_shares_no_error(tmp_path, design):
     assert np.abs(found.deviation).max() < 1e-8 and found.sigma.max() < 1e-3  # float32 of a mesh of 80 mm
 
 
-@first_short("seed", range(3))
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
 def test_readings_that_points_share_are_in_the_σ_of_patches(tmp_path, design, seed):
     scan = write_scan(tmp_path / "scan.ply", shared_scan(seed), np.sqrt(2) * SIGMA_M)
     found = patches(design, scan)

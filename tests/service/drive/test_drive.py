@@ -81,6 +81,7 @@ def test_the_sphere_of_normals_receives_the_light_of_the_sky(drive, tmp_path, co
     assert rms(ours, truth) < rms(np.maximum(NORMALS @ directions.T, 0) @ best, truth) + 0.005
 
 
+@pytest.mark.long
 def test_normals_that_no_lamp_lights_have_no_colour(drive, tmp_path):
     """Lamps on one side, under a neutral sky: u'v' was said to be .51 off, that of nothing from that of white."""
     write_rig(tmp_path / "rig.json", [way for way in fibonacci_sphere(200) if way[2] > 0.6], bits=16)

@@ -50,6 +50,7 @@ def test_axes_under_which_the_normals_are_of_no_surface_that_stands_free_are_nam
         assert said == [] if words is None else len(said) == 1 and words in said[0]
 
 
+@pytest.mark.long
 def test_lights_of_a_spiral_that_are_one_image_off_are_named(tmp_path):
     """Each is then turned by the golden angle, and all readings fit as well as under the right ones."""
     scene = ellipsoid(count=24)

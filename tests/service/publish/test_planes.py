@@ -68,6 +68,7 @@ def test_lights_close_to_one_another_show_their_own_images(relit, tmp_path):
     assert 255 * np.sqrt(np.mean(np.square(truth[1:] - truth[:-1]))) > 20
 
 
+@pytest.mark.long
 def test_tiles_of_each_level_are_the_whole_image_made_smaller(relit, tmp_path):
     capture(tmp_path / "cap")
     relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "openlime", "--quality", "100")

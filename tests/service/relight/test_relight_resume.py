@@ -60,6 +60,7 @@ def test_whole_frames_are_kept_and_others_made(made, tmp_path):
     assert made("--overwrite", "") == FRAMES
 
 
+@pytest.mark.long
 def test_a_frame_with_one_changed_byte_is_made_again(made, tmp_path):
     made()
     path = tmp_path / "f" / "a.2.exr"

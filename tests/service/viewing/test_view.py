@@ -101,6 +101,7 @@ def test_few_lights_with_and_without_a_mask(relit, tmp_path, lights, mask):
         assert (matte == 255).all() == (mask is None)
 
 
+@pytest.mark.long
 def test_one_pixel(relit, tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=1, lights=5))
     SurfaceMaps(camera=viewing.Capture.open(tmp_path / "cap").camera, mask=np.ones((1, 1), bool),
@@ -273,6 +274,7 @@ def test_points_are_those_of_the_cloud_and_then_the_unsure_ones(folder):
     assert found.facts["layers"][0]["name"] == "depth"
 
 
+@pytest.mark.long
 def test_every_second_pixel_of_a_large_depth_and_grey_without_the_cloud(folder, monkeypatch):
     monkeypatch.setattr(points, "MOST_POINTS", 15000)
     found = show(folder)

@@ -53,6 +53,7 @@ def test_a_mask_that_is_a_pixel_off_has_the_same_coverage(tmp_path, change):
     assert edge_error(scene, found(tmp_path, scene, mask).coverage) < 0.05
 
 
+@pytest.mark.long
 def test_a_rim_that_is_black_under_every_light_follows_the_mask(tmp_path):
     """As that of a mirror, here along the left half: the images cannot tell it from the background."""
     scene = render_covered(size=64, lights=16)

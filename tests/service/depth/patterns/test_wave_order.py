@@ -7,7 +7,6 @@ import pytest
 from service.depth.patterns.wave_order import check_order
 from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns
-from tests.marks import first_short
 from tests.service.depth.patterns.test_wave_checks import EXTENT, NOISE, changed, frames_of, said
 
 SETS = {"one": ((EXTENT,), 4), "one of eight": ((50.0,), 8), "two": ((EXTENT, 50.0), 3), "three": ((19.0, 22.0, 26.0), 4)}
@@ -81,7 +80,8 @@ def test_exchanged_loops_are_named(name):
     assert "--order axis,period,step" in order_said(frames_of(patterns), interleaved(patterns, steps))
 
 
-@first_short("order", [(26.0, 22.0, 19.0), (22.0, 19.0, 26.0), (26.0, 19.0, 22.0)])
+@pytest.mark.long
+@pytest.mark.parametrize("order", [(26.0, 22.0, 19.0), (22.0, 19.0, 26.0), (26.0, 19.0, 22.0)])
 def test_exchanged_periods_are_named(order):
     patterns = patterns_of("three")
     to = dict(zip((19.0, 22.0, 26.0), order, strict=True))

@@ -155,6 +155,7 @@ def test_normals_that_point_away_from_the_viewpoint_are_refused(tmp_path, coarse
         as_range_image(read_scan(read, listed, 0), "cloud 0", device="cpu")
 
 
+@pytest.mark.long
 def test_registered_scans_keep_their_viewpoints(tmp_path):
     clouds = [scatter(place(angle, 0.1, 2.0), 40 * RAYS // 100, seed=number) for number, angle in enumerate((0.0, 0.3))]
     file = write_set(tmp_path, [entry(cloud, tmp_path, number) for number, cloud in enumerate(clouds)])

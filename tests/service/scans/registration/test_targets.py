@@ -61,6 +61,7 @@ def test_a_target_that_moved_is_named_and_moves_no_pose():
     assert list(wrong) == ["T3"] and wrong["T3"] == {2: pytest.approx(0.004, abs=1e-3)}
 
 
+@pytest.mark.long
 def test_targets_with_the_names_of_others_are_told():
     views, scans = vases(T1=PLACES["T5"], T5=PLACES["T1"])
     found = registered(scans)

@@ -128,6 +128,7 @@ def test_light_of_the_room_is_named_and_held(tmp_path):
     assert np.median(off) > 5 and 0.5 < np.median(off / result.maps.sigma[mask]) < 1.2  # σ holds the turn, and little beside it
 
 
+@pytest.mark.long
 def test_an_outline_that_points_inwards_is_said_where_nothing_decides(tmp_path):
     """Lights near the view axis cast no shadow in a hollow, so that an object under inverted lights may be one."""
     scene = ellipsoid(largest_degrees=12)
@@ -159,6 +160,7 @@ def test_axes_of_an_object_of_parts_with_metal(tmp_path, parts, matrix, words):
     assert (error > 5 * np.maximum(result.maps.sigma[mask], 1)).sum() < 0.02 * shot.scene.mask.sum()
 
 
+@pytest.mark.long
 def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_path):
     size, flat = 64, ring(7)
     y, x = np.mgrid[:size, :size] / size * 4
