@@ -10,8 +10,8 @@ from kernels import device as devices
 from kernels.device import to_numpy
 from kernels.status import SOLVED
 from kernels.structured.pattern_frames import NoiseModel
-from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
-from service.calibrate.solvers.bundle import Certainty
+from service.calibrate.results import calibrated_camera, digits, lens_facts, manifests_to_replace, write_results
+from service.calibrate.solvers.boards.bundle import Certainty
 from service.calibrate.solvers.charuco import charuco_of, find_board, holds_a_pose
 from service.calibrate.solvers.procam import BoardView, ProCam, calibrate, first_alike, outliers, projector_corners
 from service.depth.patterns.decoders import PatternProjector
@@ -81,20 +81,16 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
         folder, reason = next(iter(remarks.items()))
         raise CalibrationError(f"{folder}: {reason} (and so with every view)")
     firsts = first_alike([(view.camera, view.projector) for view in views])
-    for number, first in enumerate(firsts):
-        if first < number:
-            remarks[views[number].name] = f"left out: a copy of {views[first].name}"
+    remarks |= {views[number].name: f"left out: a copy of {views[first].name}" for number, first in enumerate(firsts) if first < number}
     views = [view for number, view in enumerate(views) if firsts[number] == number]
     found = calibrate(views, request.board, request.square_m, camera_size, size)
     out = outliers(found)
     if request.drop_outliers and out.any():
-        for view in (view for view, bad in zip(views, out, strict=True) if bad):
-            remarks[view.name] = "left out: its error stands out"
+        remarks |= {view.name: "left out: its error stands out" for view, bad in zip(views, out, strict=True) if bad}
         views = [view for view, bad in zip(views, out, strict=True) if not bad]
         found = calibrate(views, request.board, request.square_m, camera_size, size)
         out = outliers(found)
-    for view in (view for view, bad in zip(views, out, strict=True) if bad):
-        remarks[view.name] = "its error stands out: see --drop-outliers"
+    remarks |= {view.name: "its error stands out: see --drop-outliers" for view, bad in zip(views, out, strict=True) if bad}
     timings.close()
     targets = [*captures, *others]
     paths = manifests_to_replace(targets, manifest_paths)
@@ -166,7 +162,7 @@ def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ..
     left = [{"view": name, "remark": remark} for name, remark in remarks.items() if name not in used]
     baseline = float(np.linalg.norm(found.camera_from_projector[:3, 3]))
     section = {"captures": [str(path) for path in request.captures], "rms_px": float(f"{found.rms_px:.4g}"),
-               "baseline_m": float(f"{baseline:.6g}"), "sigma": found.certainty.facts(),
+               "baseline_m": float(f"{baseline:.6g}"), "board_bend_m": digits(found.certainty.bend)[0], "sigma": found.certainty.facts(),
                "camera": lens_facts(found.camera), "projector": lens_facts(found.projector),
                "views": entries, "left_out": left}
     reports = [write_results("procam", request, _updated(capture.manifest, found, size), path, section)

@@ -1,7 +1,7 @@
 """Calibration of several cameras from a chessboard that they see at the same moments, with the error of each view.
 
-All cameras, and the poses of the board in all frames, are fitted to all corners at once (solvers/bundle.py), also to those of frames that
-some of the cameras alone see.
+All cameras, and the poses of the board in all frames, are fitted to all corners at once (solvers/boards/bundle.py), also to those of frames
+that some of the cameras alone see.
 
 Convention: as in solvers/procam.py: image coordinates have pixel centres at halves, points in space are on OpenCV's axes.
 """
@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.calibrate.results import calibrated_camera, lens_facts, manifests_to_replace, write_results
-from service.calibrate.solvers.bundle import Certainty, Sight, adjust, alone
+from service.calibrate.results import calibrated_camera, digits, lens_facts, manifests_to_replace, write_results
+from service.calibrate.solvers.boards.alone import Sight, each_alone
+from service.calibrate.solvers.boards.bundle import Certainty, adjust
+from service.calibrate.solvers.boards.contradictions import contradiction
 from service.calibrate.solvers.charuco import charuco_of, find_board
-from service.calibrate.solvers.contradictions import contradiction
 from service.calibrate.solvers.procam import LEAST_VIEWS, Lens, board_points, first_alike, lens_of
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
@@ -80,11 +81,12 @@ def calibrate(frames: Sequence[BoardFrame], cameras: Sequence[tuple[str, Resolut
         if shared < LEAST_VIEWS:
             raise CalibrationError(f"{name}: {shared} of the views show the board to it and to the first camera: give {LEAST_VIEWS} or "
                                    "more")
-    devices = [alone(own, size, name) for own, (name, size) in zip(sights, cameras, strict=True)]
-    found = adjust([sight for own in sights for sight in own], devices)
+    every_sight, (names, sizes) = [sight for own in sights for sight in own], zip(*cameras, strict=True)
+    devices = each_alone(every_sight, sizes, names)
+    found = adjust(every_sight, devices)
     lenses = [lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True)]
     errors = {(sight.device, sight.view): float(error) for sight, error in zip(found.sights, found.errors_px, strict=True)}
-    said = contradiction(found, [name for name, _ in cameras], [frame.name for frame in frames])
+    said = contradiction(found, names, [frame.name for frame in frames])
     others = []
     for device, (name, _) in enumerate(cameras[1:], start=1):
         both = [sight.view for sight in sights[device] if sight.view in firsts]
@@ -173,7 +175,8 @@ def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ..
                         "sigma": other.certainty.facts(),
                         "views": [{"frame": frame, "camera_px": float(f"{first:.4g}"), "other_px": float(f"{second:.4g}")}
                                   for frame, first, second in other.views]})
-    section = {"capture": str(request.capture), "camera": lens_facts(lens), "other_cameras": entries}
+    section = {"capture": str(request.capture), "camera": lens_facts(lens), "other_cameras": entries,
+               "board_bend_m": digits(others[0].certainty.bend)[0]}
     reports = [write_results("stereo", request, _updated(target.manifest, lens, others), path, section)
                for target, path in zip(targets, paths, strict=True)]
     summary = ", ".join(f"{name}: {other.rms_px:.3f} px RMS, baseline {_baseline(other):.4f} m, "

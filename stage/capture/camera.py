@@ -9,8 +9,9 @@ from stage.model import FirstFault, Fraction, Positive, Resolution, Strict, Text
 from stage.pixels import Crop
 from stage.transforms import Transform, pixel_centres
 
-UNDISTORT_ITERATIONS = 20
-"""The number of fixed-point iterations that invert the distortion; ordinary lenses converge to 1e-10 in about ten."""
+UNDISTORT_ITERATIONS, FARTHEST = 20, 1e6
+"""The number of fixed-point iterations that invert the distortion, where ordinary lenses converge to 1e-10 in about ten, and the largest
+coordinate that is returned where they run off, because the lens as it was calibrated has no such place."""
 
 
 class Distortion(Strict):
@@ -36,10 +37,11 @@ class Distortion(Strict):
     def undo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ideal image-plane coordinates that `apply` distorts to x and y, found by fixed-point iteration."""
         ideal_x, ideal_y = x, y
-        for _ in range(UNDISTORT_ITERATIONS):
-            distorted_x, distorted_y = self.apply(ideal_x, ideal_y)
-            ideal_x, ideal_y = ideal_x + (x - distorted_x), ideal_y + (y - distorted_y)
-        return ideal_x, ideal_y
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(UNDISTORT_ITERATIONS):
+                distorted_x, distorted_y = self.apply(ideal_x, ideal_y)
+                ideal_x, ideal_y = ideal_x + (x - distorted_x), ideal_y + (y - distorted_y)
+        return np.clip(ideal_x, -FARTHEST, FARTHEST), np.clip(ideal_y, -FARTHEST, FARTHEST)
 
 
 class Camera(Strict):

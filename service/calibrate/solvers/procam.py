@@ -2,7 +2,7 @@
 
 A projector records no image, but the decoded patterns give the projector coordinates of each camera pixel. Near a corner of the board
 this map is a homography of the plane of the board; fitted to the decoded pixels around the corner it gives the corner in the
-projector with sub-pixel accuracy. With corners in both images, both are calibrated as cameras are (bundle.py).
+projector with sub-pixel accuracy. With corners in both images, both are calibrated as cameras are (boards/bundle.py).
 
 Source: Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012 (local homographies);
     Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3.
@@ -17,8 +17,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from service.calibrate.solvers.bundle import Certainty, Pinhole, Sight, adjust, alone
-from service.calibrate.solvers.contradictions import contradiction
+from service.calibrate.solvers.boards.alone import Pinhole, Sight, each_alone
+from service.calibrate.solvers.boards.bundle import Certainty, adjust
+from service.calibrate.solvers.boards.contradictions import contradiction
 from stage.capture.camera import Distortion
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import distortion_of
@@ -139,14 +140,14 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
     if len(views) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views)} of the views can be used: give {LEAST_VIEWS} or more, the board tilted differently in each")
     every = board_points(board, square_m)
-    sights = [[Sight(device, number, every[view.kept], (view.camera, view.projector)[device]) for number, view in enumerate(views)]
-              for device in (0, 1)]
-    devices = [alone(own, size, f"the {name}") for own, size, name in
-               zip(sights, (camera_size, projector_size), ("camera", "projector"), strict=True)]
-    found = adjust([*sights[0], *sights[1]], devices)
+    sights = [Sight(device, number, every[view.kept], (view.camera, view.projector)[device]) for device in (0, 1)
+              for number, view in enumerate(views)]
+    names = "the camera", "the projector"
+    devices = each_alone(sights, (camera_size, projector_size), names)
+    found = adjust(sights, devices)
     camera, projector = (lens_of(lens, device.rms_px) for lens, device in zip(found.lenses, devices, strict=True))
     errors, lit = found.errors_px.reshape(2, len(views))
-    said = contradiction(found, ("the camera", "the projector"), [view.name for view in views])
+    said = contradiction(found, names, [view.name for view in views])
     return ProCam(camera, projector, found.pose(1), errors, lit, found.rms_px(), found.certainty(1, "camera and projector", said))
 
 

@@ -233,6 +233,16 @@ def test_distortion_is_opencvs():
     assert np.allclose(lens.apply(np.array(x), np.array(y)), expected, rtol=1e-14)
 
 
+@pytest.mark.filterwarnings("error")
+def test_places_that_a_lens_cannot_have_are_far_beside_or_nothing():
+    """Boards in the middle of an image left k2 = -2.1, which folds its corners: relit depth printed warnings of NumPy."""
+    lens = Distortion(model="brown_conrady", k=(0.05, -2.1, 0.0))
+    x, y = lens.undo(np.array([0.1, 0.8, -3.0]), np.array([0.05, 0.6, 2.0]))
+    assert np.allclose([part[0] for part in lens.apply(x[:1], y[:1])], (0.1, 0.05))
+    assert not ((np.abs(x[1:]) <= 1) & (np.abs(y[1:]) <= 1)).any()
+    assert not np.isinf((x * y).astype(np.float32)).any()  # later steps raise no warning either
+
+
 @pytest.mark.parametrize("camera", [
     perspective(distortion=Distortion(model="brown_conrady", k=(-0.1, 0.02, 0.0), p=(0.001, -0.002))), perspective(principal_px=None),
     Camera(projection="orthographic", resolution=(40, 30), pixel_size_m=0.01, principal_px=(3.0, 8.5)),

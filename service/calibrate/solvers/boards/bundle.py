@@ -1,11 +1,12 @@
 """Cameras and projectors that see the same boards, fitted to the corners of all views at once, and how sure that is.
 
 That corners fit says little: boards that all lie alike are explained as well by another focal length and other distances. The covariance of
-all parameters, those of the poses of the boards among them, tells by how much depths may be off.
+all parameters, those of the poses of the boards among them, tells by how much depths may be off. Boards are not quite flat: their form is
+a parameter too, of second order across and down.
 
 Source: Hartley and Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed. 2004, chapter 5 for the covariance of an estimate, and
     chapter 18 for the adjustment of bundles; Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3, for
-    the start, and for the parallel poses that leave a lens open.
+    the parallel poses that leave a lens open.
 
 Convention: the axes of OpenCV, y down, z forward, but for `Bundle.pose`.
 """
@@ -18,11 +19,17 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from service.calibrate.solvers.boards.alone import TILT, Alone, Pinhole, Sight, alone, moved
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import camera_from_projector
 
-LENS, POSE = 8, 6
-"""Parameters of a lens (focal lengths, principal point, k1, k2, p1, p2), and of a pose (rotation vector and translation)."""
+LENS, POSE, BEND = 8, 6, 3
+"""Parameters of a lens (focal lengths, principal point, k1, k2, p1, p2), of a pose (rotation vector and translation), and of the board's
+form (heights of x², xy and y², each 1 at its outermost corners)."""
+BENT = 6.0
+"""Standard deviations of a bend, from which what a device leaves alone is taken on bent boards."""
+TOLD_BEND = 0.002
+"""Height of a bend, as a part of the board's length, from which it is said: what corners are off by as their finder is must not be."""
 DOUBTED, REFUSED = 0.01, 0.03
 """Standard deviation of depths, as a part of them, from which a calibration is remarked on, and from which it is none: beyond it another
 focal length far away fits as well, which the covariance does not tell."""
@@ -30,34 +37,8 @@ GRID = 16
 """Places across and down the image at which the standard deviation of depths is taken; it changes smoothly."""
 MOST_STEPS = 100
 """Evaluations after which a fit ends: where the boards determine the devices a dozen are enough."""
-TILT = "tilt the board by 30° or more, to another side in each view, and bring it nearer and farther"
-
-
-class Pinhole(NamedTuple):
-    """A lens as OpenCV has it."""
-
-    matrix: np.ndarray  # [3, 3]
-    distortion: np.ndarray  # [k1, k2, p1, p2]
-
-
-class Sight(NamedTuple):
-    """The corners of the board of one view, as one device sees them."""
-
-    device: int
-    view: int
-    board: np.ndarray  # [corners, 3] in the frame of the board
-    corners: np.ndarray  # [corners, 2]
-
-
-class Alone(NamedTuple):
-    """A device that was calibrated from its own sights alone."""
-
-    lens: Pinhole
-    boards: dict[int, np.ndarray]
-    """By the number of each view that the device sees: rotation vector and translation [6] from the board to the device."""
-    rms_px: float
-    size: tuple[int, int]
-    """Width and height of its image."""
+UP = np.array([0.0, 0.0, 1.0])
+"""The normal of a board."""
 
 
 class Certainty(NamedTuple):
@@ -73,6 +54,8 @@ class Certainty(NamedTuple):
     """The same over the corners of the boards."""
     covered: float
     """The part of the first device's image in which boards were."""
+    bend: tuple[float, float]
+    """The height of the board's highest corner above its lowest, 0 where it is flat to what noise leaves, and its length, in metres."""
     contradiction: str | None = None
     """What there is to say of devices that contradict each other."""
 
@@ -83,7 +66,12 @@ class Certainty(NamedTuple):
                 "principal_px": [float(f"{pixels:.3g}") for pixels in self.principal_px]}
 
     def warnings(self) -> list[str]:
-        """Return what there is to say of depths that are not sure."""
+        """Return what there is to say of depths that are not sure, and of a board that is not flat."""
+        height, length = self.bend
+        bent = [f"the board is bent by {1000 * height:.2g} mm over {1000 * length:.0f} mm, which is fitted: a flat one is surer"]
+        return [*self._doubts(), *(bent if height > TOLD_BEND * length else [])]
+
+    def _doubts(self) -> list[str]:
         if self.contradiction is not None:
             return [f"{self.contradiction} (depths are known to {100 * self.depth:.2g} % alone)"]
         if self.depth_at_boards > DOUBTED:
@@ -105,6 +93,7 @@ class Bundle(NamedTuple):
     covariance: np.ndarray  # of the parameters of all lenses and then of all places but the first
     excess: float
     """What the corners are off because the devices share boards and places, relative to what noise would leave: 1 but for chance."""
+    bend: np.ndarray  # [BEND] metres, of boards beyond the form that `sights` have
 
     def rms_px(self, counted: Sequence[bool] | None = None) -> float:
         """Return the root mean square error of the corners. `counted`: of each sight, whether its corners count; None: all do."""
@@ -127,7 +116,7 @@ class Bundle(NamedTuple):
                                    f"{focal.min():.3g} px: {TILT}")
         seen = {sight.view for sight in self.sights if sight.device == device}
         sights = [sight for sight in self.sights if not sight.device and sight.view in seen]
-        corners = np.concatenate([_moved(sight.board, self.boards[sight.view]) for sight in sights])
+        corners = np.concatenate([moved(sight.board, self.boards[sight.view]) for sight in sights])
         at_boards = float(np.sqrt(self._depth_variances(corners, device, covariance).mean()))
         if not at_boards < REFUSED:  # nor is it when it is no number
             known = f"depths would be known to {100 * at_boards:.2g} % alone" if at_boards < 1 else "depths would be unknown"
@@ -138,8 +127,9 @@ class Bundle(NamedTuple):
         variances = np.minimum(self._depth_variances(image, device, covariance), 1) if len(image) else np.zeros(0)
         depth = float(np.sqrt((variances.sum() + lost) / max(len(image) + lost, 1)))
         first, other = (sigma[:, :2] / focal).max(axis=1)
+        across, down, height = np.ptp(np.concatenate([sight.board for sight in self.sights]), axis=0)
         return Certainty((float(first), float(other)), (float(sigma[0, 2:4].max()), float(sigma[1, 2:4].max())), max(depth, at_boards),
-                         at_boards, _covered(sights, self.alone[0].size), contradiction)
+                         at_boards, _covered(sights, self.alone[0].size), (float(height), float(max(across, down))), contradiction)
 
     def _image_points(self, device: int, depth: float) -> tuple[np.ndarray, int]:
         """Return points at a depth that are spread over the image of the first device and that the other one sees, [points, 3], and the
@@ -169,24 +159,20 @@ class Bundle(NamedTuple):
         return np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
 
 
-def alone(sights: Sequence[Sight], size: tuple[int, int], name: str) -> Alone:
-    """Calibrate a device from its own sights, by Zhang's method. `size`: width and height in pixels."""
-    try:
-        rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-            [sight.board.astype(np.float32) for sight in sights], [sight.corners.astype(np.float32) for sight in sights], size, None, None,
-            flags=cv2.CALIB_FIX_K3)  # without corners at the border of the image k3 would fit noise
-    except cv2.error as error:
-        raise CalibrationError(f"the poses of the board do not determine {name} ({str(error.err).strip().lower()}): {TILT}") from error
-    focal = np.diag(matrix)[:2]
-    if not (np.isfinite(matrix).all() and focal.min() > 0.1 * max(size) and focal.max() < 100 * max(size)):
-        wrong = focal.max() if focal.min() > 0.1 * max(size) else focal.min()
-        raise CalibrationError(f"the focal length of {name} comes out as {wrong:.3g} px: the poses do not determine it: {TILT}")
-    boards = {sight.view: np.concatenate([turn.ravel(), shift.ravel()]) for sight, turn, shift in zip(sights, turns, shifts, strict=True)}
-    return Alone(Pinhole(matrix, distortion.ravel()[:4]), boards, float(rms), size)
-
-
 def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
-    """Fit lenses, places and boards to the corners of all sights. Each device shares a view or more with the first."""
+    """Fit lenses, places and boards to the corners of all sights, also the form that boards share. Each device shares a view or more with
+    the first."""
+    found = _adjusted(sights, devices)
+    if not (np.abs(found.bend) > BENT * np.sqrt(np.diag(found.covariance)[-BEND:])).any():
+        return found
+    bent = [sight._replace(board=sight.board + np.outer(_bends(sights, sight) @ found.bend, UP)) for sight in sights]
+    again = [alone([sight for sight in bent if sight.device == number], device.size, "a device", lens.matrix)
+             for number, (device, lens) in enumerate(zip(devices, found.lenses, strict=True))]
+    worse = any(now.rms_px > before.rms_px for now, before in zip(again, devices, strict=True))
+    return found if worse else _adjusted(bent, again)  # what contradicts otherwise may look like a bend, but to no device alone
+
+
+def _adjusted(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     places = [np.zeros(POSE), *(_place(devices[0], other) for other in devices[1:])]
     views = sorted({sight.view for sight in sights})
     boards = []
@@ -194,28 +180,31 @@ def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
         number, pose = next((number, device.boards[view]) for number, device in enumerate(devices) if view in device.boards)
         back = inverse(places[number])
         boards.append(after(pose, back))
-    start = np.concatenate([*(_values(device.lens) for device in devices), *places[1:], *boards])
+    start = np.concatenate([*(_values(device.lens) for device in devices), *places[1:], np.zeros(BEND), *boards])
     shared = len(start) - POSE * len(views)
+    form = slice(shared - BEND, shared)
+    bends = [_bends(sights, sight) for sight in sights]
 
     def parts(values: np.ndarray) -> tuple[list[Pinhole], np.ndarray, dict[int, np.ndarray]]:
         lenses = [_lens(values[LENS * device:LENS * (device + 1)]) for device in range(len(devices))]
-        places = np.concatenate([np.zeros(POSE), values[LENS * len(devices):shared]]).reshape(-1, POSE)
+        places = np.concatenate([np.zeros(POSE), values[LENS * len(devices):form.start]]).reshape(-1, POSE)
         return lenses, places, dict(zip(views, values[shared:].reshape(-1, POSE), strict=True))
 
     def shown(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return by how much all corners are off, [2 corners of all sights], and the slopes by all parameters."""
         lenses, places, boards = parts(values)
         offs, rows = [], []
-        for sight in sights:
+        for sight, bend in zip(sights, bends, strict=True):
             board, place = boards[sight.view], places[sight.device]
             moved = cv2.composeRT(board[:3], board[3:], place[:3], place[3:])  # with derivatives by the four
-            seen, by = cv2.projectPoints(sight.board.astype(np.float64), *moved[:2], *lenses[sight.device])
+            seen, by = cv2.projectPoints(sight.board + np.outer(bend @ values[form], UP), *moved[:2], *lenses[sight.device])
             by_board, by_place = (np.block([[moved[2 + of], moved[3 + of]], [moved[6 + of], moved[7 + of]]]) for of in (0, 2))
             row = np.zeros((2 * len(sight.board), len(start)))
             row[:, LENS * sight.device:LENS * (sight.device + 1)] = by[:, POSE:POSE + LENS]
             if sight.device:
                 first = LENS * len(devices) + POSE * (sight.device - 1)
                 row[:, first:first + POSE] = by[:, :POSE] @ by_place
+            row[:, form] = (by[:, 3:POSE] @ cv2.Rodrigues(moved[0])[0] @ UP)[:, None] * np.repeat(bend, 2, axis=0)
             first = shared + POSE * views.index(sight.view)
             row[:, first:first + POSE] = by[:, :POSE] @ by_board
             offs.append((seen.reshape(-1, 2) - sight.corners).ravel())
@@ -229,7 +218,7 @@ def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     errors = np.split(off, np.cumsum([2 * len(sight.board) for sight in sights])[:-1])
     covariance, excess = _covariance(slopes, off, of_device, devices)
     return Bundle(list(sights), list(devices), *parts(found), np.array([np.sqrt(2 * np.mean(error**2)) for error in errors]),
-                  covariance[:shared, :shared], excess)
+                  covariance[:shared, :shared], excess, found[form])
 
 
 def _covariance(slopes: np.ndarray, off: np.ndarray, of_device: np.ndarray, devices: Sequence[Alone]) -> tuple[np.ndarray, float]:
@@ -244,11 +233,11 @@ def _covariance(slopes: np.ndarray, off: np.ndarray, of_device: np.ndarray, devi
     except np.linalg.LinAlgError:
         return np.full((len(unit), len(unit)), np.inf), 1.0
     spread, left, expected = np.zeros_like(inverse), 0.0, 0.0
-    for device, alone in enumerate(devices):
+    for device, fitted in enumerate(devices):
         own = scaled[of_device == device]
         normal = own.T @ own
-        parameters = LENS + POSE * len(alone.boards)
-        squares = alone.rms_px**2 * len(own) / 2
+        parameters = LENS + POSE * len(fitted.boards)
+        squares = fitted.rms_px**2 * len(own) / 2
         noise = squares / max(len(own) - parameters, 1)
         spread += normal * noise
         left += float((off[of_device == device]**2).sum()) - squares
@@ -263,9 +252,11 @@ def _place(first: Alone, other: Alone) -> np.ndarray:
     return np.concatenate([Rotation.from_rotvec(poses[:, :3]).mean().as_rotvec(), np.median(poses[:, 3:], axis=0)])
 
 
-def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return points [points, 3] moved by a pose [6]."""
-    return np.asarray(points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])
+def _bends(sights: Sequence[Sight], of: Sight) -> np.ndarray:
+    """Return by how much each corner of a sight is higher on a board of a bend of 1, [corners, BEND]. `sights`: all sights."""
+    low, high = (most([most(sight.board[:, :2], axis=0) for sight in sights], axis=0) for most in (np.min, np.max))
+    x, y = ((2 * of.board[:, :2] - low - high) / (high - low)).T
+    return np.stack([x**2, x * y, y**2], axis=-1)
 
 
 def _covered(sights: Sequence[Sight], size: tuple[int, int]) -> float:

@@ -1,8 +1,8 @@
 """Devices that contradict each other: each fits the boards alone, and together they do not.
 
 The reasons are those that the corners of one device alone do not show: a device that was moved, turned or refocused between the views,
-views whose images are not of one moment or were exchanged, and images that are mirrored. A board that is bent, or whose squares are none,
-is another one.
+views whose images are not of one moment or were exchanged, and images that are mirrored or sheared. A board whose squares are none is
+another one.
 
 Convention: as bundle.py.
 """
@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from service.calibrate.solvers.bundle import Alone, Bundle, Sight, adjust, after, alone, inverse
+from service.calibrate.solvers.boards.alone import Alone, Sight, alone, camera_matrix, each_alone
+from service.calibrate.solvers.boards.bundle import Bundle, adjust, after, inverse
 from stage.errors import CalibrationError
 
 CONTRADICTED, AGREED = 4.0, 2.0
@@ -24,6 +25,8 @@ LEAST_VIEWS = 3
 """Views that must agree, for the others to be named."""
 ASPECT, MOST_ASPECT = 0.01, 0.05
 """By how much taller squares are tried to be than wide, and the most by which prints are: a print is scaled by a few percent at most."""
+SHEARED = 0.75
+"""Part of what a device leaves alone, down to which its image must fit sheared, for keystone correction to be named."""
 ALIKE = 2.0
 """Readings fit alike whose views agree to within this many times the best one's pixels."""
 Reading = Callable[[np.ndarray], np.ndarray]
@@ -40,6 +43,10 @@ def contradiction(found: Bundle, names: Sequence[str], views: Sequence[str]) -> 
             reading = _other_reading(found, device, names[device], names[0])
             if reading is not None:
                 return f"{said}; {reading}"
+    for device, name in list(enumerate(names))[1:]:
+        sheared = _sheared(found, device, name)
+        if sheared is not None:
+            raise CalibrationError(f"{said}; {sheared}")
     taller = _other_aspect(found, names)
     if taller is not None:
         return f"{said}; {taller}"
@@ -57,9 +64,8 @@ def _other_aspect(found: Bundle, names: Sequence[str]) -> str | None:
     """Return by how much the squares of the board are taller than wide, if nothing is contradicted then; None where that is not so."""
 
     def fitted(aspect: float) -> Bundle:
-        sights = [sight._replace(board=sight.board * [1, aspect, 1]) for sight in found.sights]
-        own = [[sight for sight in sights if sight.device == device] for device in range(len(found.alone))]
-        return adjust(sights, [alone(seen, device.size, name) for seen, device, name in zip(own, found.alone, names, strict=True)])
+        sights = [sight._replace(board=sight.board * [1, aspect, 0]) for sight in found.sights]
+        return adjust(sights, each_alone(sights, [device.size for device in found.alone], names))
 
     aspect = 1.0
     try:
@@ -77,6 +83,22 @@ def _other_aspect(found: Bundle, names: Sequence[str]) -> str | None:
     form = f"{100 * abs(aspect - 1):.2g} % {'taller than wide' if aspect > 1 else 'wider than tall'}"
     return (f"with squares that are {form} they fit to {best.rms_px():.2g} px: measure the print along both sides, and print it without "
             "scaling")
+
+
+def _sheared(found: Bundle, device: int, name: str) -> str | None:
+    """Return by how much the image of a device is sheared, if it fits alone then; None where that is not so."""
+    own, sights = found.alone[device], [sight for sight in found.sights if sight.device == device]
+    matrix = camera_matrix(sights, found.alone[0])
+    shear, matrix[0, 1] = matrix[0, 1] / matrix[1, 1], 0
+    upright = [sight._replace(corners=sight.corners - shear * (sight.corners[:, 1:] - matrix[1, 2]) * [1, 0]) for sight in sights]
+    try:
+        best = alone(upright, own.size, name, matrix)
+    except CalibrationError:
+        return None
+    if not best.rms_px < SHEARED * own.rms_px:
+        return None
+    return (f"with the image of {name} sheared by {100 * abs(shear):.2g} % it fits alone to {best.rms_px:.2g} px, which no lens does: "
+            "switch keystone correction off, and project the images unscaled")
 
 
 def _odd_views(found: Bundle) -> list[int]:
@@ -129,7 +151,8 @@ def _other_reading(found: Bundle, device: int, name: str, first: str) -> str | N
     turns = np.zeros(6), np.array([0, np.pi, 0, x, 0, 0]), np.array([np.pi, 0, 0, 0, y, 0]), np.array([0, 0, np.pi, x, y, 0])
     trials = []
     for words, cause, reading in readings:
-        sights = [sight._replace(corners=reading(sight.corners)) for sight in found.sights if sight.device == device]
+        sights = [sight._replace(board=sight.board * [1, 1, 0], corners=reading(sight.corners)) for sight in found.sights
+                  if sight.device == device]
         read = alone(sights, (max(own.size), max(own.size)), name)
         for turn in turns:
             turned = read._replace(boards={view: after(turn, pose) for view, pose in read.boards.items()})

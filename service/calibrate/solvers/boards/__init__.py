@@ -1,0 +1,1 @@
+"""Devices and boards that explain all corners together, and what devices contradict."""
