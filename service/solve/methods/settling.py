@@ -2,9 +2,9 @@
 
 Bounced light makes hollows look shallower, so that the first search underestimates form factors, and its albedo contains the bounce. One
 pixel of each block is searched again in its direct light; what this changes is carried over to the block, and the arriving light follows
-anew. In each round shadows say how strong the arriving light is: gloss and surfaces that the camera does not see add to that of the form
-factors, and where the scale of the lights is unknown, so is that of albedo. Where shadows show no bounced light, or none falls and lit
-readings are explained much better without it, none is taken out at all.
+anew. In each round shadows and lit readings say how strong the arriving light is: gloss, which sends most of it where light falls, and
+surfaces that the camera does not see add to that of the form factors, and where the scale of the lights is unknown, so is that of albedo,
+which shadows alone tell. Where shadows show no bounced light, or none falls and lit readings deny it, none is taken out at all.
 
 Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 4: shape and interreflection are corrected in turn.
 """
@@ -154,7 +154,7 @@ def _shown_by_lit(light: DirectLight, pixels: np.ndarray, start: np.ndarray, sha
                   pick: Callable[[np.ndarray], Samples]) -> float | None:
     """Return the strength of the arriving light that the lit readings of some pixels show, or None where it is not above 1."""
     costs = [_cost(light._replace(albedo_scale=each), pixels, start, shape, pick) for each in TRIED]
-    if min(costs) > (1 - LEAST_FALL) * costs[0]:
+    if min(costs) >= min((1 - LEAST_FALL) * costs[0], costs[0] - LEAST_GAIN):
         return None
     half = (costs[0] + min(costs)) / 2
     at = next(number for number, cost in enumerate(costs) if cost <= half)
@@ -171,6 +171,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     turned = start
 
     def with_strength() -> tuple[DirectLight, ScaleFit | None]:
+        """Return the light with the strength that shadows and lit readings show now, and the fit by shadows."""
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole))
         if relative:
             return light._replace(albedo_scale=1.0 if fit is None else fit.scale), fit
