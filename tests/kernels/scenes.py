@@ -8,10 +8,8 @@ from kernels import packs
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.model.misfit import Misfit, standard_error
-from tests.reference.sampling import lattice
 
 GREY = (0.2126, 0.7152, 0.0722)
-cap = lattice
 HALF_ROUNDING = 2.0**-11
 """Largest relative error of a half value."""
 HALF_STEP = 2.0**-25

@@ -45,7 +45,7 @@ class Groove:
 class Trough(Groove):
     """The same with a round floor, a parabola whose sides rise with a slope of `steepest` at the edge."""
 
-    def __init__(self, side: int, steepest: float = 1.0):
+    def __init__(self, side: int, steepest: float):
         super().__init__(side)
         x, y, _ = self.points.T
         self.bend = steepest / side

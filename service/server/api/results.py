@@ -126,7 +126,7 @@ async def download_result(file: Annotated[OpenFile, Depends(opened)], if_match: 
     headers = headers_of(file)
     if unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
-    part = _part(wanted or "", file) if if_range is None or if_range == _etag(file) else None
+    part = asked_range(wanted or "", file) if if_range is None or if_range == _etag(file) else None
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{file.size}"
     sent = range(file.size) if part is None else part
@@ -153,17 +153,17 @@ async def download_environment(file: Annotated[OpenFile, Depends(opened_environm
 
 def unchanged(file: OpenFile, if_match: str | None, if_none_match: str | None) -> bool:
     """Return whether the asker has a file already; refuse the request where it is for another than the file is now."""
-    if if_match is not None and not _names(if_match, _etag(file), strong=True):
+    if if_match is not None and not tag_matches(if_match, _etag(file), strong=True):
         raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {_etag(file)}", headers={"ETag": _etag(file)})
-    return if_none_match is not None and _names(if_none_match, _etag(file), strong=False)
+    return if_none_match is not None and tag_matches(if_none_match, _etag(file), strong=False)
 
 
-def _names(header: str, etag: str, *, strong: bool) -> bool:
+def tag_matches(header: str, etag: str, *, strong: bool) -> bool:
     """Return whether a list of entity tags contains `etag` or is *; with `strong`, weak tags do not count (RFC 9110, 13.1)."""
     return header.strip() == "*" or any(tag == etag and not (weak and strong) for weak, tag in TAG.findall(header))
 
 
-def _part(header: str, file: OpenFile) -> range | None:
+def asked_range(header: str, file: OpenFile) -> range | None:
     """Return the bytes that a Range header names; None where it is malformed or names several, which may be ignored (RFC 9110, 14.2)."""
     found = RANGE.fullmatch(header)
     if found is None:

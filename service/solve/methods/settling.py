@@ -11,7 +11,7 @@ Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, sec
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,12 +117,13 @@ def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Calla
     positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     within = _middles_of(light, pick)
     shown = shown_bounce(*readings_in_shadow(light, within.pixels, normal[:, within.pixels].T, within.readings))
-    bounced = _is_lit_by_bounces(light, normal, shape, pick, within, relative=relative) if shown is None else has_bounced(light, shown)
+    cost = _cost_of(light, within.pixels, normal[:, within.pixels].T, shape, pick)
+    bounced = _is_lit_by_bounces(cost, relative=relative) if shown is None else has_bounced(light, shown)
     if not bounced:
         return Settled(light._replace(arriving=None), shown)
     if light.field is not None:
         return Settled(light, shown)
-    return _in_rounds(light, normal, shape, pick, within, relative=relative)._replace(shown=shown)
+    return _in_rounds(light, normal, shape, pick, within, cost, relative=relative)._replace(shown=shown)
 
 
 def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]
@@ -133,27 +134,30 @@ def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: 
     return samples, descend(samples, start, shape=shape)
 
 
-def _is_lit_by_bounces(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples],
-                       within: Middles, *, relative: bool) -> bool:
-    """Return whether lit readings leave it possible that light has bounced; parameters as of `settle`."""
-    cost = partial(_cost, pixels=within.pixels, start=normal[:, within.pixels].T, shape=shape, pick=pick)
-    once, without = cost(light), cost(light._replace(arriving=None))
+def _cost_of(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]
+             ) -> Callable[[float], float]:
+    """Return what tells the mean cost of some of these pixels by the strength of the arriving light, and measures each strength once;
+    parameters as of `_searched`."""
+    some = evenly(len(pixels), COUNTED)
+
+    def cost(strength: float) -> float:
+        arriving = light._replace(albedo_scale=strength) if strength else light._replace(arriving=None)
+        return float(_searched(arriving, pixels[some], start[some], shape, pick)[1].cost.mean(dtype=np.float64))
+
+    return cache(cost)
+
+
+def _is_lit_by_bounces(cost: Callable[[float], float], *, relative: bool) -> bool:
+    """Return whether lit readings leave it possible that light has bounced. `cost`: of `_cost_of`. `relative`: as of `settle`."""
+    once, without = cost(1.0), cost(0.0)
     if relative:
         return without >= min(BETTER * once, once - LEAST_GAIN)
-    twice = cost(light._replace(albedo_scale=2.0))
-    return without > NOT_WORSE * once or twice <= max(DENIED * once, once + LEAST_GAIN)
+    return without > NOT_WORSE * once or cost(2.0) <= max(DENIED * once, once + LEAST_GAIN)
 
 
-def _cost(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]) -> float:
-    """Return the mean cost of some of these pixels in direct light; parameters as of `_searched`."""
-    some = evenly(len(pixels), COUNTED)
-    return float(_searched(light, pixels[some], start[some], shape, pick)[1].cost.mean(dtype=np.float64))
-
-
-def _shown_by_lit(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape,
-                  pick: Callable[[np.ndarray], Samples]) -> float | None:
-    """Return the strength of the arriving light that the lit readings of some pixels show, or None where it is not above 1."""
-    costs = [_cost(light._replace(albedo_scale=each), pixels, start, shape, pick) for each in TRIED]
+def _shown_by_lit(cost: Callable[[float], float]) -> float | None:
+    """Return the strength of the arriving light that lit readings show, or None where it is not above 1. `cost`: of `_cost_of`."""
+    costs = [cost(each) for each in TRIED]
     if min(costs) >= min((1 - LEAST_FALL) * costs[0], costs[0] - LEAST_GAIN):
         return None
     half = (costs[0] + min(costs)) / 2
@@ -161,9 +165,9 @@ def _shown_by_lit(light: DirectLight, pixels: np.ndarray, start: np.ndarray, sha
     return float(np.interp(half, costs[at - 1:at + 1][::-1], TRIED[at - 1:at + 1][::-1]))
 
 
-def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], within: Middles, *,
-               relative: bool) -> Settled:
-    """Return the light after the rounds; parameters as of `settle`."""
+def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], within: Middles,
+               cost: Callable[[float], float], *, relative: bool) -> Settled:
+    """Return the light after the rounds. `cost`: of `_cost_of`, before them. Others as of `settle`."""
     assert light.arriving is not None
     solved, block, middles, whole = within
     pixels = np.flatnonzero(solved)
@@ -175,7 +179,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole))
         if relative:
             return light._replace(albedo_scale=1.0 if fit is None else fit.scale), fit
-        lit = _shown_by_lit(light, middles, turned, shape, pick)
+        lit = _shown_by_lit(cost)
         if fit is None:
             return light._replace(albedo_scale=lit or 1.0), None
         fit = fit._replace(scale=min(fit.scale, LARGEST_STRENGTH))
@@ -190,6 +194,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
+        cost = _cost_of(light, middles, turned, shape, pick)
     settled, fit = with_strength()
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
     ends = [_searched(settled._replace(albedo_scale=times * settled.albedo_scale), middles, turned, shape, pick)[1].normal

@@ -17,18 +17,19 @@ from kernels.photometric.search.hypotheses import LobeShape, search_normals
 from kernels.photometric.search.lobe_shape import choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.svbrdf import average_normals, nearby_shapes, solve_svbrdf
-from tests.kernels.scenes import GREY, bits, cap, store
+from tests.kernels.scenes import GREY, bits, store
 from tests.reference import hypotheses
 from tests.reference import microfacet as twin
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(48, 70.0)
+LIGHTS = lattice(48, 70.0)
 VIEW = np.array([0.0, 0.0, 1.0])
 COLOUR = np.array([0.6, 0.35, 0.2])
 
 
 def tilted(count: int, largest_degrees: float = 50.0) -> np.ndarray:
     """[count, 3] normals, evenly over a cap."""
-    return cap(count, largest_degrees)
+    return lattice(count, largest_degrees)
 
 
 def render(normal: np.ndarray, *, albedo=COLOUR, alpha=0.16, f0=0.04, rough=None, slope=0.0, gamma=twin.GGX, lights=LIGHTS) -> np.ndarray:

@@ -17,10 +17,10 @@ from kernels.surface.interreflection import gather_light
 from kernels.surface.normal_map import supported_normals
 from kernels.surface.shadows import NO_REACH, Projection, Relief, in_shadow_within, relief_of
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
-from tests.kernels.scenes import cap
 from tests.kernels.surface import shapes
 from tests.kernels.surface.test_integrate import solve, worst
 from tests.reference.groove import Groove
+from tests.reference.sampling import lattice
 
 STEP_AT, STEP_HEIGHT = 40, 10.0
 
@@ -245,7 +245,7 @@ def test_shapes_are_checked(device):
 
 def test_taking_off_the_bounce_leaves_the_direct_light(device):
     """radiance = direct + ρ K radiance: with the true K and albedo what is left is the direct light, to half rounding of the images."""
-    groove, lights, albedo = Groove(12), cap(16, 40.0), 0.7
+    groove, lights, albedo = Groove(12), lattice(16, 40.0), 0.7
     whole, direct = groove.radiance(lights, albedo)
     assert np.median(whole / np.maximum(direct, 1e-9)) > 1.05  # the bounces are no trifle
     samples, _ = sample(np.repeat(whole[None], 3, axis=0), device, lights=lights)

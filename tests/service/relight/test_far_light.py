@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 from tests.scenes.captures import rgb, write_exr
 from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 from tests.service.relight.test_clipping import relight
@@ -11,7 +11,7 @@ from tests.service.relight.test_clipping import relight
 pytestmark = pytest.mark.long
 
 SURFACE = dome(40)
-LIGHTS = cap(48, 45)
+LIGHTS = lattice(48, 45)
 SUN_DEGREES = 80
 """Angle of the sun from the view axis: 35 degrees beyond the captured lights, which are 11 degrees apart."""
 

@@ -8,7 +8,7 @@ import pytest
 from kernels.relight.directions.direction_grid import direction_grid
 from kernels.relight.model.responses import respond
 from stage.capture.camera import Camera
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
 
@@ -29,7 +29,7 @@ def scene(request, tmp_path_factory):
     """A capture under lights all around or in front, maps, and an environment with two suns in a sky of two colours. With perspective, the
     images are still those of parallel lines of sight, which a model that is only compared with itself does not mind."""
     folder = tmp_path_factory.mktemp("range")
-    write_dome(folder / "cap", SURFACE, directions=cap(48, 45) if request.param == "in front" else None)
+    write_dome(folder / "cap", SURFACE, directions=lattice(48, 45) if request.param == "in front" else None)
     if request.param == "perspective":
         size = len(SURFACE.mask)
         camera = Camera(projection="perspective", resolution=(size, size), focal_px=(60.0, 60.0), principal_px=(size / 2, size / 2))

@@ -7,7 +7,6 @@ Convention: the axes of OpenCV, y down, z forward.
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import NamedTuple
 
 import cv2
@@ -71,15 +70,25 @@ def alone(sights: Sequence[Sight], size: tuple[int, int], name: str, start: np.n
 def each_alone(sights: Sequence[Sight], sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> list[Alone]:
     """Calibrate all devices, each from its own sights alone. The others begin also where they see the boards as the first one has them, and
     the better fit counts: a principal point far outside the image, as of lens shift, is missed from the middle."""
-    first, *others = ([sight for sight in sights if sight.device == device] for device in range(len(sizes)))
-    found = [alone(first, sizes[0], names[0])]
-    for own, size, name in zip(others, sizes[1:], names[1:], strict=True):
-        fits = []
+    found = [alone(sights_of(0, sights), sizes[0], names[0])]
+    for device, (size, name) in enumerate(zip(sizes[1:], names[1:], strict=True), start=1):
+        own = sights_of(device, sights)
+        fits: list[Alone] = []
+        failures: list[CalibrationError] = []
         for start in (None, camera_matrix(own, found[0]) * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]):  # without shear
-            with suppress(CalibrationError):
+            try:
                 fits.append(alone(own, size, name, start))
-        found.append(min(fits, key=lambda fit: fit.rms_px) if fits else alone(own, size, name))
+            except CalibrationError as error:
+                failures.append(error)
+        if not fits:
+            raise failures[0]
+        found.append(min(fits, key=lambda fit: fit.rms_px))
     return found
+
+
+def sights_of(device: int, sights: Sequence[Sight]) -> list[Sight]:
+    """Return the sights of one device."""
+    return [sight for sight in sights if sight.device == device]
 
 
 def camera_matrix(sights: Sequence[Sight], first: Alone) -> np.ndarray:

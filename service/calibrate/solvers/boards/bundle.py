@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from service.calibrate.solvers.boards.alone import TILT, Alone, Pinhole, Sight, alone, moved
+from service.calibrate.solvers.boards.alone import TILT, Alone, Pinhole, Sight, alone, moved, sights_of
 from stage.errors import CalibrationError
 from stage.importers.opencv_file import camera_from_projector
 
@@ -165,8 +165,8 @@ def adjust(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     found = _adjusted(sights, devices)
     if not (np.abs(found.bend) > BENT * np.sqrt(np.diag(found.covariance)[-BEND:])).any():
         return found
-    bent = [sight._replace(board=sight.board + np.outer(_bends(sights, sight) @ found.bend, UP)) for sight in sights]
-    again = [alone([sight for sight in bent if sight.device == number], device.size, "a device", lens.matrix)
+    bent = [sight._replace(board=sight.board + np.outer(bend @ found.bend, UP)) for sight, bend in zip(sights, _bends(sights), strict=True)]
+    again = [alone(sights_of(number, bent), device.size, "a device", lens.matrix)
              for number, (device, lens) in enumerate(zip(devices, found.lenses, strict=True))]
     worse = any(now.rms_px > before.rms_px for now, before in zip(again, devices, strict=True))
     return found if worse else _adjusted(bent, again)  # what contradicts otherwise may look like a bend, but to no device alone
@@ -183,7 +183,7 @@ def _adjusted(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
     start = np.concatenate([*(_values(device.lens) for device in devices), *places[1:], np.zeros(BEND), *boards])
     shared = len(start) - POSE * len(views)
     form = slice(shared - BEND, shared)
-    bends = [_bends(sights, sight) for sight in sights]
+    bends = _bends(sights)
 
     def parts(values: np.ndarray) -> tuple[list[Pinhole], np.ndarray, dict[int, np.ndarray]]:
         lenses = [_lens(values[LENS * device:LENS * (device + 1)]) for device in range(len(devices))]
@@ -196,15 +196,15 @@ def _adjusted(sights: Sequence[Sight], devices: Sequence[Alone]) -> Bundle:
         offs, rows = [], []
         for sight, bend in zip(sights, bends, strict=True):
             board, place = boards[sight.view], places[sight.device]
-            moved = cv2.composeRT(board[:3], board[3:], place[:3], place[3:])  # with derivatives by the four
-            seen, by = cv2.projectPoints(sight.board + np.outer(bend @ values[form], UP), *moved[:2], *lenses[sight.device])
-            by_board, by_place = (np.block([[moved[2 + of], moved[3 + of]], [moved[6 + of], moved[7 + of]]]) for of in (0, 2))
+            posed = cv2.composeRT(board[:3], board[3:], place[:3], place[3:])  # with derivatives by the four
+            seen, by = cv2.projectPoints(sight.board + np.outer(bend @ values[form], UP), *posed[:2], *lenses[sight.device])
+            by_board, by_place = (np.block([[posed[2 + of], posed[3 + of]], [posed[6 + of], posed[7 + of]]]) for of in (0, 2))
             row = np.zeros((2 * len(sight.board), len(start)))
             row[:, LENS * sight.device:LENS * (sight.device + 1)] = by[:, POSE:POSE + LENS]
             if sight.device:
                 first = LENS * len(devices) + POSE * (sight.device - 1)
                 row[:, first:first + POSE] = by[:, :POSE] @ by_place
-            row[:, form] = (by[:, 3:POSE] @ cv2.Rodrigues(moved[0])[0] @ UP)[:, None] * np.repeat(bend, 2, axis=0)
+            row[:, form] = (by[:, 3:POSE] @ cv2.Rodrigues(posed[0])[0] @ UP)[:, None] * np.repeat(bend, 2, axis=0)
             first = shared + POSE * views.index(sight.view)
             row[:, first:first + POSE] = by[:, :POSE] @ by_board
             offs.append((seen.reshape(-1, 2) - sight.corners).ravel())
@@ -252,11 +252,13 @@ def _place(first: Alone, other: Alone) -> np.ndarray:
     return np.concatenate([Rotation.from_rotvec(poses[:, :3]).mean().as_rotvec(), np.median(poses[:, 3:], axis=0)])
 
 
-def _bends(sights: Sequence[Sight], of: Sight) -> np.ndarray:
-    """Return by how much each corner of a sight is higher on a board of a bend of 1, [corners, BEND]. `sights`: all sights."""
-    low, high = (most([most(sight.board[:, :2], axis=0) for sight in sights], axis=0) for most in (np.min, np.max))
-    x, y = ((2 * of.board[:, :2] - low - high) / (high - low)).T
-    return np.stack([x**2, x * y, y**2], axis=-1)
+def _bends(sights: Sequence[Sight]) -> list[np.ndarray]:
+    """Return, for each sight, by how much its corners are higher on a board of a bend of 1, [corners, BEND]."""
+    corners = np.concatenate([sight.board[:, :2] for sight in sights])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y = ((2 * corners - low - high) / (high - low)).T
+    heights = np.stack([x**2, x * y, y**2], axis=-1)
+    return np.split(heights, np.cumsum([len(sight.board) for sight in sights])[:-1])
 
 
 def _covered(sights: Sequence[Sight], size: tuple[int, int]) -> float:

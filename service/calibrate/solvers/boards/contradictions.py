@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from service.calibrate.solvers.boards.alone import Alone, Sight, alone, camera_matrix, each_alone
+from service.calibrate.solvers.boards.alone import Alone, Sight, alone, camera_matrix, each_alone, sights_of
 from service.calibrate.solvers.boards.bundle import Bundle, adjust, after, inverse
 from stage.errors import CalibrationError
 
@@ -87,7 +87,7 @@ def _other_aspect(found: Bundle, names: Sequence[str]) -> str | None:
 
 def _sheared(found: Bundle, device: int, name: str) -> str | None:
     """Return by how much the image of a device is sheared, if it fits alone then; None where that is not so."""
-    own, sights = found.alone[device], [sight for sight in found.sights if sight.device == device]
+    own, sights = found.alone[device], sights_of(device, found.sights)
     matrix = camera_matrix(sights, found.alone[0])
     shear, matrix[0, 1] = matrix[0, 1] / matrix[1, 1], 0
     upright = [sight._replace(corners=sight.corners - shear * (sight.corners[:, 1:] - matrix[1, 2]) * [1, 0]) for sight in sights]

@@ -10,9 +10,10 @@ from kernels.photometric.gradient.highlight import fit_highlights, specular_norm
 from kernels.photometric.gradient.moments import fit_moments
 from kernels.photometric.gradient.separation import HIDDEN_TILT, separate_by_colour, separate_polarised
 from kernels.status import Status
-from tests.kernels.scenes import GREY, HALF_ROUNDING, angle_degrees, bits, cap, colours, store
+from tests.kernels.scenes import GREY, HALF_ROUNDING, angle_degrees, bits, colours, store
 from tests.marks import first_short
 from tests.reference import gradient as reference
+from tests.reference.sampling import lattice
 
 PAIRS = tuple((axis, sign) for axis in "xyz" for sign in (1, -1))
 THREE_AND_FULL = (("x", 1), ("y", 1), ("z", 1), ("full", 1))
@@ -80,7 +81,7 @@ def rounding_bound(shading: np.ndarray, frames) -> np.ndarray:
 @first_short("name", SETS)
 def test_a_lambertian_surface_is_exact(device, name):
     """Integrated over the sphere of light; the bound is half rounding alone and 0.01 degrees for the rest."""
-    frames, normal = SETS[name], cap(70, 90)
+    frames, normal = SETS[name], lattice(70, 90)
     shading = lambert_shading(normal, frames)
     albedo = colours(len(normal))
     band = upload(tinted(shading, albedo), device)
@@ -109,7 +110,7 @@ def test_the_fit_is_that_of_least_squares_in_float64(device):
 
 
 def test_contradiction_and_occlusion_raise_the_standard_error(device):
-    normal = np.tile(cap(1, 40), (3, 1))
+    normal = np.tile(lattice(1, 40), (3, 1))
     shading = lambert_shading(normal, PAIRS)
     shading[0, 1] *= 1.1  # one frame of a pair too bright
     shading[:, 2] = shading[:, 2] * 0.9 + 0.05  # a tenth of the light comes from neighbours, from every side alike
@@ -126,7 +127,7 @@ def test_contradiction_and_occlusion_raise_the_standard_error(device):
 def test_polarisation_tells_diffuse_and_specular_apart(device, roughness, lean, f0):
     """Up to 60 degrees from the view. The halfway vector is off by the lean of the lobe (docs/methods.md); a lobe fitted to the
     responses is off by half rounding of parallel - cross, of which a dielectric's highlight is a tenth, and by table steps."""
-    normal = cap(30, 60)
+    normal = lattice(30, 60)
     cross = tinted(lambert_shading(normal, PAIRS), 0.5 * colours(30))
     parallel = cross + lobe_shading(normal, PAIRS, roughness=roughness, f0=f0)
     band = upload(np.concatenate([cross, parallel], axis=1), device)
@@ -144,7 +145,7 @@ def test_polarisation_tells_diffuse_and_specular_apart(device, roughness, lean, 
 
 
 def test_metal_keeps_its_colour_and_no_highlight_is_no_specular(device):
-    normal = cap(20, 50)
+    normal = lattice(20, 50)
     lobe = lobe_shading(normal, PAIRS, roughness=0.3, f0=0.5)
     cross = np.full((3, 6, 20), 0.2) * (0.5 + normal[:, 2])
     red = lobe_shading(normal, PAIRS, roughness=0.3, f0=0.9)
@@ -160,7 +161,7 @@ def test_metal_keeps_its_colour_and_no_highlight_is_no_specular(device):
 
 def test_a_perspective_mirror_shows_its_normal(device):
     """A mirror reads the gradient at its mirror direction: the halfway vector is exact, whatever the view."""
-    normal = cap(40, 50)
+    normal = lattice(40, 50)
     view = -np.random.default_rng(1).normal([0, 0, -4], 0.5, (40, 3))
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     mirror = 2 * (normal * view).sum(axis=1, keepdims=True) * normal - view
@@ -173,7 +174,7 @@ def test_a_perspective_mirror_shows_its_normal(device):
 
 def test_a_rough_lobe_seen_in_perspective(device):
     """The lobe is fitted about each pixel's own line of sight, whatever its plane of incidence."""
-    normal = cap(20, 40)
+    normal = lattice(20, 40)
     view = -np.random.default_rng(2).normal([0, 0, -4], 0.8, (20, 3))
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     lobe = np.array([[reference.ggx(n, v, axis, sign, alpha=0.16, f0=0.3, nodes=60, turns=90)
@@ -189,7 +190,7 @@ def test_a_rough_lobe_seen_in_perspective(device):
 @pytest.mark.long
 def test_colour_tells_them_apart_on_a_dielectric(device):
     """Without separation the highlight tilts the normal towards the mirror direction; the chromatic part does not know it."""
-    normal = cap(40, 60)
+    normal = lattice(40, 60)
     albedo = np.random.default_rng(5).permuted(np.tile([0.7, 0.4, 0.15], (40, 1)), axis=1)
     shading = tinted(lambert_shading(normal, PAIRS), albedo) + lobe_shading(normal, PAIRS, roughness=0.2, f0=0.04)
     band = upload(shading, device)
@@ -206,7 +207,7 @@ def test_colour_tells_them_apart_on_a_dielectric(device):
 
 
 def test_grey_is_ambiguous_and_says_so(device):
-    normal = cap(10, 40)
+    normal = lattice(10, 40)
     shading = tinted(lambert_shading(normal, PAIRS), np.full((10, 3), 0.5))
     band = upload(shading, device)
     mixed = moments(band, PAIRS)

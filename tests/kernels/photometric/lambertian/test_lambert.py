@@ -8,8 +8,9 @@ from kernels.photometric.lambertian.lambert import solve_lambert
 from kernels.photometric.lambertian.readings import grey_readings
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.status import Status
-from tests.kernels.scenes import GREY, angle_degrees, cap, colours, rounding_bounds, shade, solve
+from tests.kernels.scenes import GREY, angle_degrees, colours, rounding_bounds, shade, solve
 from tests.reference import photometric as reference
+from tests.reference.sampling import lattice
 
 PIXEL_COUNTS = [1, 31, 33, 4097]
 FLOAT32_DEGREES = 1e-4
@@ -18,8 +19,8 @@ both = pytest.mark.parametrize("solver", [solve_lambert, solve_robust])
 
 
 def ball(count, lights, largest=75.0):
-    normal = cap(count, 80)
-    return normal, colours(count), cap(lights, largest), 3 * colours(lights, seed=1)
+    normal = lattice(count, 80)
+    return normal, colours(count), lattice(lights, largest), 3 * colours(lights, seed=1)
 
 
 def check_exact(solved, normal, albedo, direction, irradiance):
@@ -42,8 +43,8 @@ def test_lambertian_ball(pixels, device):
 
 
 def test_three_lights_determine_the_normal_exactly(device):
-    direction = cap(3, 40)
-    normal, albedo = cap(64, 30), colours(64)  # every light above every horizon
+    direction = lattice(3, 40)
+    normal, albedo = lattice(64, 30), colours(64)  # every light above every horizon
     irradiance = 2 * colours(3, seed=3)
     solved = solve(solve_lambert, shade(normal, albedo, direction, irradiance), direction, irradiance, device)
     check_exact(solved, normal, albedo, direction, irradiance)
@@ -72,7 +73,7 @@ def test_values_are_those_of_the_twin_on_noisy_data(device):
 
 def test_pixels_with_every_reading_are_solved_alike_beside_one_that_lacks_some(device):
     """The products of the lights are summed once for packs whose pixels have every reading. To float32 sums, and their difference."""
-    normal, albedo, direction, irradiance = cap(320, 30), colours(320), cap(19, 40), 3 * colours(19, seed=1)
+    normal, albedo, direction, irradiance = lattice(320, 30), colours(320), lattice(19, 40), 3 * colours(19, seed=1)
     radiance = shade(normal, albedo, direction, irradiance)
     radiance *= np.random.default_rng(2).normal(1, 0.03, radiance.shape)
     whole = solve(solve_lambert, radiance, direction, irradiance, device)
@@ -92,7 +93,7 @@ def test_pixels_with_every_reading_are_solved_alike_beside_one_that_lacks_some(d
 @pytest.mark.parametrize("lit, status", [(0, Status.DARK), (1, Status.TOO_FEW_LIGHTS), (2, Status.TOO_FEW_LIGHTS), (3, Status.OK),
                                          (9, Status.OK)])
 def test_status_by_the_number_of_readings(solver, lit, status, device):
-    direction = cap(12, 30)
+    direction = lattice(12, 30)
     radiance = np.zeros((3, 12, 1))
     radiance[:, :lit] = direction[:lit, 2][None, :, None]  # faces +z
     solved = solve(solver, radiance, direction, np.ones((12, 3)), device)
@@ -115,7 +116,7 @@ def circle(count, off_degrees, seed=0):
 
 @both
 @pytest.mark.parametrize("direction, status", [
-    (cap(12, 0.5), Status.ILL_POSED), (cap(300, 1.0), Status.ILL_POSED), (cap(12, 3.0), Status.OK),
+    (lattice(12, 0.5), Status.ILL_POSED), (lattice(300, 1.0), Status.ILL_POSED), (lattice(12, 3.0), Status.OK),
     (circle(3, 0), Status.ILL_POSED), (circle(1000, 0), Status.ILL_POSED), (circle(40, 0.3), Status.ILL_POSED),
     (circle(40, 3), Status.OK),
 ], ids=["half a degree", "one degree", "three degrees", "3 coplanar", "1000 coplanar", "band of 0.3", "band of 3"])
@@ -153,7 +154,7 @@ def test_nothing_is_nan_whatever_the_input(solver, device):
     radiance = rng.choice(values, size=(3, 20, 3000), p=[0.02, 0.02, 0.02, 0.04, 0.4, 0.1, 0.1, 0.2, 0.1])
     radiance[:, :, :1000] = rng.choice([0.0, 1.0], size=(1, 20, 1000))  # ties alone
     radiance[:, 2:, :10] = 0
-    solved = solve(solver, radiance, cap(20, 180), np.ones((20, 3)), device)
+    solved = solve(solver, radiance, lattice(20, 180), np.ones((20, 3)), device)
     assert set(solved.status) >= {Status.OK, Status.TOO_FEW_LIGHTS}
     for name, out in solved._asdict().items():
         assert np.isfinite(out).all(), name

@@ -4,8 +4,9 @@ import pytest
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
-from tests.kernels.scenes import GREY, bits, cap, colours, store, unpack
+from tests.kernels.scenes import GREY, bits, colours, store, unpack
 from tests.reference import photometric as reference
+from tests.reference.sampling import lattice
 
 PIXEL_COUNTS = [1, 31, 33, 4097]
 """One pixel; one below and one above the CPU pack of 32; one above many packs."""
@@ -14,7 +15,7 @@ FLOAT32 = 2.0**-23 * 4
 
 
 def read(radiance, irradiance, device, saturated=None):
-    lights = pad_lights(cap(len(irradiance), 70), irradiance)
+    lights = pad_lights(lattice(len(irradiance), 70), irradiance)
     band = packs.upload(store(radiance), None if saturated is None else bits(saturated), device=device)
     return unpack(grey_readings(band, grey_factors(lights, GREY)), band), band
 
@@ -46,7 +47,7 @@ def test_what_is_no_measurement_reads_zero(device):
 
 def test_every_light_reads_the_same_grey_whatever_its_colour_and_scale(device):
     irradiance, scale = 5 * colours(9), 2.0 ** np.arange(-4, 5)
-    lights = pad_lights(cap(9, 70), irradiance, scale)
+    lights = pad_lights(lattice(9, 70), irradiance, scale)
     stored = irradiance.T[:, :, None] / scale[None, :, None]  # a white surface that faces every light
     band = packs.upload(store(stored), device=device)
     got = unpack(grey_readings(band, grey_factors(lights, GREY)), band)[:9, 0]
@@ -55,19 +56,19 @@ def test_every_light_reads_the_same_grey_whatever_its_colour_and_scale(device):
 
 def test_only_channels_that_every_light_has_are_read():
     irradiance = np.array([[1, 2, 0], [2, 4, 1]], dtype=np.float32)
-    factors = grey_factors(pad_lights(cap(2, 40), irradiance), GREY)
+    factors = grey_factors(pad_lights(lattice(2, 40), irradiance), GREY)
     np.testing.assert_allclose((factors[:2, :2] * irradiance[:, :2]).sum(axis=1), 1, rtol=FLOAT32)
     assert (factors[:, 2] == 0).all() and (factors[2:] == 0).all()
 
 
 def test_no_common_channel_is_refused():
     with pytest.raises(ArrayError, match="no channel is lit by every light"):
-        grey_factors(pad_lights(cap(3, 40), np.eye(3)), GREY)
+        grey_factors(pad_lights(lattice(3, 40), np.eye(3)), GREY)
 
 
 def test_scale_may_be_padded_already():
-    assert pad_lights(cap(3, 40), np.ones((3, 3)), [1, 2, 4, 0, 0, 0, 0, 0]).scale.tolist() == [1, 2, 4, 0, 0, 0, 0, 0]
-    assert pad_lights(cap(3, 40), np.ones((3, 3)), [1, 2, 4]).scale.tolist() == [1, 2, 4, 0, 0, 0, 0, 0]
+    assert pad_lights(lattice(3, 40), np.ones((3, 3)), [1, 2, 4, 0, 0, 0, 0, 0]).scale.tolist() == [1, 2, 4, 0, 0, 0, 0, 0]
+    assert pad_lights(lattice(3, 40), np.ones((3, 3)), [1, 2, 4]).scale.tolist() == [1, 2, 4, 0, 0, 0, 0, 0]
 
 
 UP = [[0.0, 0.0, 1.0]] * 2

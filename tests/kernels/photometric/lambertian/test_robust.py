@@ -5,8 +5,9 @@ from hypothesis import strategies as st
 
 from kernels.photometric.lambertian.robust import solve_robust
 from kernels.status import Status
-from tests.kernels.scenes import GREY, angle_degrees, cap, colours, rounding_bounds, shade, solve
+from tests.kernels.scenes import GREY, angle_degrees, colours, rounding_bounds, shade, solve
 from tests.reference import photometric as reference
+from tests.reference.sampling import lattice
 
 FLOAT32_DEGREES = 1e-4
 """Float32 sums of a hundred lights leave 1e-6 of b: 6e-5 degrees."""
@@ -25,8 +26,8 @@ def spoil(radiance, irradiance, shadowed, shining, seed=0):
 
 @pytest.mark.parametrize("lights, largest", [(100, 75.0), (200, 180.0)], ids=["cap", "whole sphere"])
 def test_shadows_and_highlights_do_not_move_a_lambertian_ball(lights, largest, device):
-    normal, albedo = cap(500, 75), colours(500)
-    direction, irradiance = cap(lights, largest), 2 * colours(lights, seed=1)
+    normal, albedo = lattice(500, 75), colours(500)
+    direction, irradiance = lattice(lights, largest), 2 * colours(lights, seed=1)
     radiance, shines = spoil(shade(normal, albedo, direction, irradiance), irradiance, 0.30, 0.15)
     solved = solve(solve_robust, radiance, direction, irradiance, device)
     assert (solved.status == Status.OK).all()
@@ -40,7 +41,7 @@ def test_shadows_and_highlights_do_not_move_a_lambertian_ball(lights, largest, d
 @pytest.mark.parametrize("brightness", [1e2, 1e4, 60000.0])
 def test_a_mirrored_lamp_does_not_matter(brightness, device):
     """One reading up to two million times as bright as the surface."""
-    normal, direction, irradiance = cap(500, 75), cap(100, 75), np.ones((100, 3))
+    normal, direction, irradiance = lattice(500, 75), lattice(100, 75), np.ones((100, 3))
     clear = 0.05 * shade(normal, np.full((500, 3), 0.5), direction, irradiance)
     radiance, _ = spoil(clear, irradiance, 0.2, 0.08)
     lamp = np.random.default_rng(1).integers(0, 100, 500)
@@ -55,8 +56,8 @@ def test_a_mirrored_lamp_does_not_matter(brightness, device):
 def noisy(pixels, lights, noise, seed, *, quantised=False, spoiled=True):
     """Readings with every kind of error at once, the same in all channels."""
     rng = np.random.default_rng(seed)
-    normal, albedo = cap(pixels, 80), np.repeat(colours(pixels, 1, seed), 3, axis=1)
-    direction, irradiance = cap(lights, 85), np.ones((lights, 3))
+    normal, albedo = lattice(pixels, 80), np.repeat(colours(pixels, 1, seed), 3, axis=1)
+    direction, irradiance = lattice(lights, 85), np.ones((lights, 3))
     radiance = shade(normal, albedo, direction, irradiance)
     if spoiled:
         radiance, _ = spoil(radiance, irradiance, 0.2, 0.1, seed)

@@ -7,11 +7,11 @@ from kernels.photometric.material.albedo_error import albedo_error
 from kernels.photometric.material.material import Material, fit_given
 from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 
 LAMBERT = LobeShape()
 PAINT = np.array([0.04, 0.04, 0.04, 0.5], np.float32)
-LIGHTS = cap(64, 80.0)
+LIGHTS = lattice(64, 80.0)
 PIXELS = 96
 
 

@@ -7,10 +7,10 @@ from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, fit_mate
 from kernels.photometric.material.material_kernel import metallic_base, metalness
 from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 
 LAMBERT = LobeShape()
-LIGHTS = cap(96, 80.0)
+LIGHTS = lattice(96, 80.0)
 COUNT = 60
 F0 = 0.04
 

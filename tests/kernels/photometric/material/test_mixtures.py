@@ -7,13 +7,13 @@ from kernels.photometric.material.mixtures import LEAST_SHARE, NO_PAIRS, choose_
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.search.hypotheses import LobeShape
 from tests.kernels.photometric.test_svbrdf import COLOUR, render, sample, tilted
-from tests.kernels.scenes import cap
 from tests.marks import first_short
+from tests.reference.sampling import lattice
 
 LAMBERT = LobeShape()
 GOLD = (0.95, 0.68, 0.35)
 PAINT = 0.04
-LIGHTS = cap(96, 80.0)
+LIGHTS = lattice(96, 80.0)
 PIXELS = 120
 
 

@@ -8,7 +8,7 @@ from kernels.photometric.material.shared_materials import LEAST_GAIN, MOST, choo
 from kernels.photometric.search.hypotheses import LobeShape
 from kernels.photometric.svbrdf import RINGS, doubt_of_f0
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 
 LAMBERT = LobeShape()
 
@@ -124,7 +124,7 @@ PAINT = np.array([[0.045, 0.045, 0.045, r] for r in (0.38, 0.45, 0.52)], dtype=n
 def test_narrow_highlights_do_not_pass_for_bright_ones(device):
     """Few of 128 lights show a lobe of roughness 0.3, so that a pixel alone often takes it for one of an F0 of up to 0.2; none does beside
     others. The 90th percentile of the error is the bias of the shared F0, 0.005, and the noise of 1 % (seed fixed)."""
-    normal, lights = tilted(160, 70.0), cap(128, 85.0)
+    normal, lights = tilted(160, 70.0), lattice(128, 85.0)
     radiance = render(normal, alpha=0.09, f0=0.04, lights=lights)
     samples, _ = sample(radiance * (1 + 0.01 * np.random.default_rng(3).normal(size=radiance.shape)), device, lights=lights)
     alone, together = (fit_material(samples, normal, shape=LAMBERT, shared=shared) for shared in (None, PAINT))

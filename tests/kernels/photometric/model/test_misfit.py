@@ -11,10 +11,11 @@ from kernels.photometric.lambertian.robust import solve_robust
 from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit
 from kernels.status import Status
 from tests.kernels.photometric.lambertian.test_robust import spoil
-from tests.kernels.scenes import GREY, angle_degrees, cap, shade, solve, store
+from tests.kernels.scenes import GREY, angle_degrees, shade, solve, store
+from tests.reference.sampling import lattice
 
 PIXELS = 600
-NORMALS = cap(PIXELS, 60)
+NORMALS = lattice(PIXELS, 60)
 
 
 def lambert(cosine):
@@ -70,7 +71,7 @@ def ratios(solver, clean, direction, noise, device):
 @pytest.mark.parametrize("lights, widest, noise", [(8, 60, 0.01), (12, 42, 0.003), (24, 75, 0.03), (96, 70, 0.003), (96, 45, 0.05)])
 @pytest.mark.parametrize("shadows", [0.0, 0.15], ids=["clear", "shadowed"])
 def test_in_the_model_the_error_is_that_of_the_noise(shadows, lights, widest, noise, device):
-    direction = cap(lights, widest)
+    direction = lattice(lights, widest)
     clean = 0.7 * lambert(direction @ NORMALS.T)
     if shadows and lights > 12:
         clean *= np.random.default_rng(1).random(clean.shape) > shadows
@@ -84,7 +85,7 @@ def test_in_the_model_the_error_is_that_of_the_noise(shadows, lights, widest, no
 @pytest.mark.parametrize("lights, widest, noise", [(12, 42, 0.01), (30, 60, 0.003), (96, 45, 0.003), (96, 75, 0.03)])
 def test_misfit_counts_where_many_lights_average_the_noise(lights, widest, noise, solver, device):
     """Plastic: errors are 2 to 6 degrees, and those that noise explains a few tenths."""
-    direction = cap(lights, widest)
+    direction = lattice(lights, widest)
     ratio = ratios(solver, plastic(NORMALS, direction), direction, noise, device)
     assert 0.35 < np.median(ratio) < 1.6  # smoothness over the lights is assumed, and a highlight is not a random function
     assert (ratio > 5).mean() < 0.01
@@ -94,7 +95,7 @@ def test_misfit_counts_where_many_lights_average_the_noise(lights, widest, noise
 def test_rejected_highlights_and_shadows_do_not_count(shining, device):
     """What is left is exact but for its noise, and the standard error is that of fewer readings."""
     rng = np.random.default_rng(3)
-    direction, irradiance = cap(40, 60), np.ones((40, 3))
+    direction, irradiance = lattice(40, 60), np.ones((40, 3))
     radiance = shade(NORMALS, np.full((PIXELS, 3), 0.7), direction, irradiance)
     spoiled, _ = spoil(radiance, irradiance, 0.2, shining)
     noise = 1 + 0.01 * rng.normal(size=(1, 40, PIXELS))
@@ -108,7 +109,7 @@ def test_rejected_highlights_and_shadows_do_not_count(shining, device):
 
 def test_a_fit_that_most_readings_contradict_is_unsure(device):
     """The lobe of a metal: its middle ranks look like another, Lambertian normal, tens of degrees off."""
-    direction = cap(60, 75)
+    direction = lattice(60, 75)
     solved, misfit = solved_twice(solve_robust, metal(NORMALS, direction), direction, 0.003, device)
     sigma = solved.sigma(misfit)
     ok = solved.status == Status.OK
@@ -122,7 +123,7 @@ def test_a_fit_that_most_readings_contradict_is_unsure(device):
 def test_fits_that_a_few_readings_agree_with_by_chance_are_unsure(lights, device):
     """Plaster with metal parts and cast shadows: three readings always fit some normal, and many do that are tens of degrees off."""
     rng = np.random.default_rng(lights)
-    direction = cap(lights, 60)
+    direction = lattice(lights, 60)
     clean = np.where(rng.random(PIXELS) < 0.2, metal(NORMALS, direction), 0.7 * lambert(direction @ NORMALS.T))
     clean = clean * np.where(rng.random(clean.shape) < 0.15, 0.05, 1)  # some light reaches shadows
     solved, misfit = solved_twice(solve_robust, clean, direction, 0.003, device)
@@ -135,7 +136,7 @@ def test_fits_that_a_few_readings_agree_with_by_chance_are_unsure(lights, device
 
 @pytest.mark.parametrize("lights", [5, 6, 10])
 def test_noise_alone_does_not_pass_for_contradiction(lights, device):
-    solved, misfit = solved_twice(solve_robust, 0.7 * lambert(cap(lights, 40) @ NORMALS.T), cap(lights, 40), 0.02, device)
+    solved, misfit = solved_twice(solve_robust, 0.7 * lambert(lattice(lights, 40) @ NORMALS.T), lattice(lights, 40), 0.02, device)
     ok = solved.status == Status.OK
     assert np.median(solved.sigma(misfit)[ok]) < 5 * np.median(angle_degrees(solved.normal, NORMALS)[ok])
 

@@ -5,10 +5,11 @@ from kernels import packs
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.samples import device_values, gather, host_values, per_pixel, to_host
-from tests.kernels.scenes import GREY, cap, store
+from tests.kernels.scenes import GREY, store
+from tests.reference.sampling import lattice
 
 LIGHTS, PIXELS = 5, 75
-DIRECTION = pad_lights(cap(LIGHTS, 40), np.ones((LIGHTS, 3)))
+DIRECTION = pad_lights(lattice(LIGHTS, 40), np.ones((LIGHTS, 3)))
 RADIANCE = np.random.default_rng(0).uniform(0.1, 1, (3, LIGHTS, PIXELS))
 
 

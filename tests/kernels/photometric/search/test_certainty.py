@@ -11,8 +11,8 @@ from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfi
 from kernels.photometric.search.survey import CLOSE
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
-from tests.kernels.scenes import cap
 from tests.reference import microfacet as twin
+from tests.reference.sampling import lattice
 
 NOISE = 0.01
 
@@ -37,7 +37,7 @@ def test_a_metal_under_few_lights_is_not_quietly_wrong(device, count):
 
     A hundredth of the pixels may be off by more than five standard deviations and five degrees, as of every method.
     """
-    lights = cap(count, 75.0)
+    lights = lattice(count, 75.0)
     normal = tilted(300, 60.0)
     radiance = noisy(render(normal, albedo=np.zeros(3), alpha=0.2, f0=0.8, lights=lights))
     fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.4, -0.4, 0]), shape=LobeShape())

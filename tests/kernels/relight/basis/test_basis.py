@@ -9,8 +9,9 @@ from kernels.errors import ArrayError
 from kernels.relight.basis.basis import MAX_CHUNKS, gram, principal, projection, squared_residual
 from kernels.relight.basis.rti import HSH_TERMS, biquadratic, fit_weights, hemispherical_harmonics, separate
 from kernels.relight.frames.combine import combine_batch
-from tests.kernels.scenes import HALF_ROUNDING, cap, shade, store
+from tests.kernels.scenes import HALF_ROUNDING, shade, store
 from tests.reference.light_basis import harmonics, polynomial, relative_rms, truncation
+from tests.reference.sampling import lattice
 
 
 def captured(lights, pixels, rank=None, seed=0):
@@ -119,7 +120,7 @@ def test_what_does_not_fit_is_refused(device):
         squared_residual(band, np.ones((3, 8)), np.zeros((2, 3, band.packs * devices.pack_width(device))), np.zeros((3, 7, 2)))
 
 
-LIGHTS = cap(200, 85)
+LIGHTS = lattice(200, 85)
 
 
 def test_the_biquadratic_is_in_the_order_of_the_file():
@@ -141,7 +142,7 @@ def test_what_lies_in_the_functions_is_fitted_exactly(functions):
 def test_a_lambertian_ball_is_close(terms, limit):
     """max(0, n·l) is not in any of the spaces; the limits are the figures of the float64 twin on these normals and lights, rounded up."""
     functions = polynomial(LIGHTS) if terms is None else harmonics(LIGHTS, terms)
-    normal = cap(300, 60)
+    normal = lattice(300, 60)
     radiance = shade(normal, np.ones((300, 3)), LIGHTS, np.ones((200, 3)))[0]
     ours = biquadratic(LIGHTS) if terms is None else hemispherical_harmonics(LIGHTS, terms)
     error = relative_rms(ours @ (fit_weights(ours) @ radiance), radiance)
@@ -163,7 +164,7 @@ def test_a_colour_times_a_luminance_is_separated():
     rng = np.random.default_rng(3)
     functions, colour = biquadratic(LIGHTS), rng.uniform(0.1, 0.8, (40, 3))
     colour[7] = 0
-    normal = cap(40, 50)
+    normal = lattice(40, 50)
     values = 255 * shade(normal, colour, LIGHTS, np.full((200, 3), np.pi)).clip(0, 1)
     fitted = np.einsum("tl,clp->tcp", fit_weights(functions), values).astype(np.float32)
     found = separate(fitted, functions)

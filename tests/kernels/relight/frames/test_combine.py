@@ -9,8 +9,9 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.relight.frames import combine as combining
-from tests.kernels.scenes import cap, colours, shade, store
+from tests.kernels.scenes import colours, shade, store
 from tests.reference.relight import weighted_sum
+from tests.reference.sampling import lattice
 
 PIXEL_COUNTS = [1, 31, 33, 4097]
 FRAMES = [1, 3, 7, 33]
@@ -97,7 +98,7 @@ def test_rows_are_summed_as_images_are(frames, channels, device):
 @given(chosen=st.permutations(range(20)), powers=st.lists(st.floats(0.0, 4.0), min_size=5, max_size=5))
 def test_superposition(chosen, powers):
     """Five lights on at once look as the weighted sum of their images does."""
-    normal, albedo, direction, irradiance = cap(100, 80), colours(100), cap(20, 90), colours(20, seed=2)
+    normal, albedo, direction, irradiance = lattice(100, 80), colours(100), lattice(20, 90), colours(20, seed=2)
     alone = shade(normal, albedo, direction, irradiance)
     lit = np.zeros(20)
     lit[list(chosen[:5])] = powers

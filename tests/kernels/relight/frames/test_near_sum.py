@@ -11,12 +11,13 @@ from service.relight.weights.weighting import integrate_discs
 from service.requests.relight import LightWeights
 from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
 from tests.kernels.relight.surfaces import FLOAT, LOBE, captured, scattered_pixels
-from tests.kernels.scenes import cap, colours
+from tests.kernels.scenes import colours
 from tests.reference import shading as reference
+from tests.reference.sampling import lattice
 
 SHARE = 5e-6
 """Shares come from float32 directions and planes; lights here are 0.1 rad apart or more."""
-LIGHTS = cap(20, 180)
+LIGHTS = lattice(20, 180)
 NEAR = {
     "point": sources.point(np.array([0.3, -0.4, 1.2]), np.array([1, 2, 3.0])),
     "behind": sources.point(np.array([-0.3, 0.4, -1.2]), np.array([1, 2, 3.0])),
@@ -61,8 +62,8 @@ def test_it_is_the_twin(given, count, device):
     assert count == 1 or expected.max() > 0.001
 
 
-LAYOUTS = {"octahedron": AXES, "icosahedron": icosahedron() @ turn(0).T, "even": LIGHTS, "many": cap(150, 180), "any": scattered(40, 2),
-           "cube": CUBE, "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "half": cap(96, 90),
+LAYOUTS = {"octahedron": AXES, "icosahedron": icosahedron() @ turn(0).T, "even": LIGHTS, "many": lattice(150, 180), "any": scattered(40, 2),
+           "cube": CUBE, "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "half": lattice(96, 90),
            "dome": np.concatenate([AXES[[1]], *(ring(12, e) for e in (0, 30, 60))])}
 
 

@@ -6,10 +6,11 @@ import pytest
 from kernels.relight.model.beyond import LONGEST_REACH, compare_beyond, followed, inward_pairs, reach, share_beyond, spacing
 from tests.kernels.relight.lights import AXES, icosahedron, scattered
 from tests.kernels.relight.surfaces import LOBE, captured, facing, scattered_pixels
-from tests.kernels.scenes import cap, colours
+from tests.kernels.scenes import colours
 from tests.reference import shading as reference
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(24, 45)
+LIGHTS = lattice(24, 45)
 IRRADIANCE = 3 * colours(24, seed=4)
 PAIRS = inward_pairs(LIGHTS)
 
@@ -33,7 +34,7 @@ def test_light_is_beyond_from_one_to_two_spacings_of_the_nearest_light():
 
 
 def test_between_lights_all_around_nothing_is_beyond():
-    for direction in (cap(48, 180), icosahedron(), cap(96, 180)):
+    for direction in (lattice(48, 180), icosahedron(), lattice(96, 180)):
         assert share_beyond(direction, scattered(4000, 1)).max() < 0.35
 
 

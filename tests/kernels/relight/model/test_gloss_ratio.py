@@ -6,10 +6,11 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.relight.model.gloss_ratio import MOST_RATIO, sum_shown
 from tests.kernels.relight.surfaces import LOBE, captured, scattered_pixels
-from tests.kernels.scenes import cap, colours
+from tests.kernels.scenes import colours
 from tests.reference import shading as reference
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(24, 180)
+LIGHTS = lattice(24, 180)
 IRRADIANCE = 3 * colours(24, seed=4)
 
 

@@ -11,11 +11,12 @@ from kernels.relight.model.shading import SecondLobe, upload_surface
 from service.relight.weights.triangulation import left_out
 from tests.kernels.relight.lights import AXES, icosahedron
 from tests.kernels.relight.surfaces import LOBE, captured, facing, pack_bytes, scattered_pixels, stored, upload
-from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store
+from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, colours, store
 from tests.reference import shading as reference
 from tests.reference.microfacet import distribution
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(24, 180)
+LIGHTS = lattice(24, 180)
 NEIGHBOURS, SHARES = left_out(LIGHTS)
 IRRADIANCE = 3 * colours(24, seed=4)
 
@@ -276,7 +277,7 @@ def test_lobes_that_the_lights_can_tell_stay():
 def test_narrower_lobes_become_wide_and_look_the_same_from_afar():
     """F0 · D at 75 degrees from the peak, where D is α² / π sin⁴ up to α² cot²."""
     for roughness in (0.1, 0.2, 0.4):
-        specular, f0, wide = lobes(roughness, cap(60, 180))
+        specular, f0, wide = lobes(roughness, lattice(60, 180))
         assert wide[0] > 0.25
         far = np.cos(np.radians(75))
         expected = specular * distribution(far, np.float32(roughness) ** 2)

@@ -7,10 +7,11 @@ from kernels.relight.model.lobe_profile import PLAIN, fit_profile, profile_momen
 from kernels.relight.model.shading import shade, upload_surface
 from kernels.relight.model.sources import far
 from tests.kernels.relight.surfaces import LOBE, captured, scattered_pixels
-from tests.kernels.scenes import cap, colours
+from tests.kernels.scenes import colours
 from tests.reference import shading as reference
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(64, 85)
+LIGHTS = lattice(64, 85)
 IRRADIANCE = 3 * colours(64, seed=4)
 SIDE = 12
 """Pixels along the side of a square of neighbours."""

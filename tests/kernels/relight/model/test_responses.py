@@ -10,10 +10,11 @@ from kernels.relight.model.responses import empty_responses, respond, shown_glos
 from kernels.relight.model.shading import shade_frames, upload_sources
 from tests.kernels.relight.lights import scattered
 from tests.kernels.relight.surfaces import FLOAT, LOBE, captured, pack_bytes, radiance, scattered_pixels, upload
-from tests.kernels.scenes import cap, colours
+from tests.kernels.scenes import colours
 from tests.reference import shading as reference
+from tests.reference.sampling import lattice
 
-LIGHTS = cap(12, 170)
+LIGHTS = lattice(12, 170)
 IRRADIANCE = 2 * colours(12, seed=1)
 
 

@@ -7,10 +7,10 @@ from scipy.spatial import SphericalVoronoi
 from kernels.relight.directions.latlong import cut
 from kernels.relight.weights.cells import integrate_cells, nearest_light
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
-from tests.kernels.scenes import cap
 from tests.marks import first_short
 from tests.reference import relight as reference
 from tests.reference.relight import rotation_about, rotation_about_y, texel_directions, texel_solid_angles
+from tests.reference.sampling import lattice
 
 HALF_DEGREE = 360, 720
 """A map whose texels are one sample each."""
@@ -25,13 +25,14 @@ borders of cells: a third of a² sin θ cos θ / 2, where a is half its azimuth.
 
 @pytest.mark.parametrize("rows, cols", [(90, 180), (64, 128), (720, 1440)])
 def test_a_constant_map_sends_each_cell_its_solid_angle(rows, cols, device):
-    cells = integrate_cells(np.full((rows, cols, 3), 2.5), cap(50, 180), STILL, device=device)
+    cells = integrate_cells(np.full((rows, cols, 3), 2.5), lattice(50, 180), STILL, device=device)
     np.testing.assert_allclose(cells.energy[0], 2.5 * np.repeat(cells.solid_angle[0][:, None], 3, axis=1), rtol=SUM)
     assert cells.solid_angle.sum() == pytest.approx(texel_solid_angles(rows, cols).sum(), rel=SUM)
 
 
-@pytest.mark.parametrize("direction", [cap(20, 180), cap(96, 180), cap(331, 180), scattered(20, 1), scattered(96, 2), scattered(331, 3),
-                                       cap(60, 90)], ids=["20", "96", "331", "any 20", "any 96", "any 331", "half the sphere"])
+@pytest.mark.parametrize("direction", [lattice(20, 180), lattice(96, 180), lattice(331, 180), scattered(20, 1), scattered(96, 2),
+                                       scattered(331, 3), lattice(60, 90)],
+                         ids=["20", "96", "331", "any 20", "any 96", "any 331", "half the sphere"])
 def test_cells_are_the_polygons_of_spherical_voronoi(direction, device):
     """Exact polygons by SciPy."""
     cells = integrate_cells(np.ones((*HALF_DEGREE, 3)), direction, STILL, device=device)
@@ -57,7 +58,7 @@ def test_symmetric_lights_have_equal_cells(direction, seed, device):
 @pytest.mark.parametrize("rows, cols, seed", [(7, 14, None), (16, 32, 1), (30, 20, 2)])
 def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     """Which sends whole samples of a sixth of a degree or less to the nearest light."""
-    environment, direction = np.random.default_rng(rows).gamma(0.3, 5.0, (rows, cols, 3)), cap(17, 150)
+    environment, direction = np.random.default_rng(rows).gamma(0.3, 5.0, (rows, cols, 3)), lattice(17, 150)
     rotation = np.eye(3) if seed is None else turn(seed)
     cells = integrate_cells(environment, direction, rotation[None], device=device)
     down, across = -(-1080 // rows), -(-2160 // cols)
@@ -137,7 +138,7 @@ def test_spin_turns_the_environment_from_z_towards_x(spin, light, device):
 @first_short("seed", range(4))
 def test_turning_a_map_about_any_axis_is_turning_the_lights_back(seed, device):
     """A map that brightens along an axis, turned in closed form."""
-    direction, rotation = cap(40, 180), turn(seed)
+    direction, rotation = lattice(40, 180), turn(seed)
     axis, middles = np.array([0.6, 0.0, 0.8]), texel_directions(*HALF_DEGREE)
     still, turned = (np.repeat(1 + (middles @ a)[..., None], 3, axis=2) for a in (axis, rotation @ axis))
     spun = integrate_cells(still, direction, rotation[None], device=device)
@@ -160,7 +161,7 @@ def test_maps_of_any_shape_are_cut_finely_both_ways(shape, device):
 
 
 def test_a_map_of_several_bands(device, monkeypatch):
-    environment, direction = np.random.default_rng(8).random((30, 60, 3)), cap(25, 180)
+    environment, direction = np.random.default_rng(8).random((30, 60, 3)), lattice(25, 180)
     whole = integrate_cells(environment, direction, turn(1)[None], device=device)
     monkeypatch.setattr("kernels.relight.directions.latlong.BAND_SAMPLES", 5000)
     np.testing.assert_allclose(integrate_cells(environment, direction, turn(1)[None], device=device).energy, whole.energy, rtol=SUM)
@@ -175,7 +176,7 @@ def test_of_lights_in_one_place_the_first_has_the_cell(device):
     assert (np.delete(cells.energy[0], np.s_[::3], axis=0) == 0).all()
 
 
-@first_short("direction", [cap(31, 180), AXES, ring(40, 0), scattered(100, 5), AXES[:1]], ids=["31", "axes", "lunes", "100", "one"])
+@first_short("direction", [lattice(31, 180), AXES, ring(40, 0), scattered(100, 5), AXES[:1]], ids=["31", "axes", "lunes", "100", "one"])
 def test_nearest_light_by_brute_force(direction, device):
     whole = cut(37, 75)
     grid = whole._replace(**{name: getattr(whole, name)[3::7] for name in ("polar", "solid_angle", "texel_row")})

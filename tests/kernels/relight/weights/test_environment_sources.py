@@ -9,8 +9,9 @@ from kernels.relight.model import sources
 from kernels.relight.weights.environment_sources import BROAD_SAMPLES, MOST_SMALL, SAMPLES, sample_environment, split_environment
 from tests.kernels.relight.lights import SUM, sun
 from tests.kernels.relight.surfaces import facing, radiance
-from tests.kernels.scenes import angle_degrees, cap
+from tests.kernels.scenes import angle_degrees
 from tests.reference.relight import texel_directions, texel_solid_angles
+from tests.reference.sampling import lattice
 
 
 def noise(rows, cols, seed=0):
@@ -113,7 +114,7 @@ def test_a_white_map_lights_a_matt_pixel_by_its_albedo(rows, device):
     the solid angles of the contract are too large by (π / rows)² / 24; and boxes that the horizon cuts are taken for one side's."""
     got = sample_environment(np.ones((rows, 2 * rows, 3)))
     given = sources.far(got.direction, got.energy)
-    for normal in cap(12, 180):
+    for normal in lattice(12, 180):
         lit = radiance(facing(1, normal=normal, albedo=0.6), given, device)[:3, 0]
         np.testing.assert_allclose(lit, 0.6, rtol=1.5e-3)
 
@@ -125,7 +126,7 @@ def test_samples_light_a_pixel_as_the_map_does(device):
     got = sample_environment(environment)
     given = sources.far(got.direction, got.energy)
     directions, amount = texel_directions(48, 96).reshape(-1, 3), (environment * texel_solid_angles(48, 96)[..., None]).reshape(-1, 3)
-    for normal in cap(12, 180):
+    for normal in lattice(12, 180):
         lit = radiance(facing(1, normal=normal), given, device)[:3, 0]
         np.testing.assert_allclose(lit, np.maximum(directions @ normal, 0) @ amount / np.pi, rtol=6e-3)
 

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 from service.relight.weights.triangulation import left_out, lights_around
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 from tests.reference.shading import shares_around
 
 
@@ -23,12 +23,12 @@ def geodesic():
 DOME = geodesic() @ turn(2).T
 DOME = DOME[DOME[:, 2] > -0.1]
 """Triangles everywhere above, nothing below."""
-ROUND = {"octahedron": AXES, "icosahedron": icosahedron(), "geodesic": geodesic(), "even": cap(20, 180), "any": scattered(20, 13),
+ROUND = {"octahedron": AXES, "icosahedron": icosahedron(), "geodesic": geodesic(), "even": lattice(20, 180), "any": scattered(20, 13),
          "turned": icosahedron() @ turn(1).T}
 """All around, in triangles that no four lights make a polygon of: without imaginary lights."""
 LAYOUTS = {**ROUND, "cube": CUBE, "dodecahedron": dodecahedron(), "dome": DOME, "tetrahedron": CUBE[[0, 3, 5, 6]],
-           "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "front": cap(40, 50),
-           "many": cap(200, 180), "half": cap(96, 90), "scattered": scattered(60, 4), "twice": np.repeat(icosahedron(), 2, axis=0),
+           "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "front": lattice(40, 50),
+           "many": lattice(200, 180), "half": lattice(96, 90), "scattered": scattered(60, 4), "twice": np.repeat(icosahedron(), 2, axis=0),
            "horizon": np.concatenate([ring(16, 0), ring(8, 45), [[0, 1, 0]]])}
 LAYOUT = pytest.mark.parametrize("direction", LAYOUTS.values(), ids=LAYOUTS)
 SHARE = 2e-7
@@ -92,9 +92,9 @@ def test_below_a_dome_are_lights_of_its_rim():
 
 def test_many_samples_are_their_parts():
     samples = scattered(9001, 1)
-    around, share = lights_around(cap(30, 180), samples)
+    around, share = lights_around(lattice(30, 180), samples)
     for start in (0, 4000, 8990):
-        some = lights_around(cap(30, 180), samples[start : start + 11])
+        some = lights_around(lattice(30, 180), samples[start : start + 11])
         np.testing.assert_array_equal(around[start : start + 11], some[0])
         np.testing.assert_allclose(share[start : start + 11], some[1], atol=SHARE)
 

@@ -12,15 +12,15 @@ from service.relight.weights.quadrature import integrate_kernel, layer_parts, sh
 from service.relight.weights.triangulation import share_smooth
 from service.relight.weights.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
-from tests.kernels.scenes import cap
 from tests.marks import first_short
 from tests.reference.relight import best_weights, matern, rotation_about_y, samples, texel_directions, texel_solid_angles
+from tests.reference.sampling import lattice
 
 ROUNDING = 1e-9
 """Error of the inverse of a well-conditioned matrix, relative to the sum of the weights."""
 SAMPLED = 2e-3
 """Part of the whole energy by which a light is off because a map is cut into 2048 samples; it is .0004 where an even sky is bright."""
-DOME = cap(300, 180)[cap(300, 180)[:, 2] > 0]
+DOME = lattice(300, 180)[lattice(300, 180)[:, 2] > 0]
 
 
 def lobes(rng, rows=64, cols=128):
@@ -33,7 +33,7 @@ def lobes(rng, rows=64, cols=128):
     return radiance
 
 
-@pytest.mark.parametrize("directions", [AXES, scattered(40, 1), cap(128, 180), cap(60, 45), DOME],
+@pytest.mark.parametrize("directions", [AXES, scattered(40, 1), lattice(128, 180), lattice(60, 45), DOME],
                          ids=["axes", "scattered", "even", "cone", "dome"])
 def test_light_from_a_captured_direction_is_that_image(directions):
     for light in range(0, len(directions), 5):
@@ -53,7 +53,7 @@ def test_no_other_weights_that_are_not_negative_expect_less_error(seed):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("directions", [scattered(300, 3), cap(128, 180), DOME])
+@pytest.mark.parametrize("directions", [scattered(300, 3), lattice(128, 180), DOME])
 def test_many_lights_meet_the_conditions_of_the_best_weights(directions):
     """Karush, Kuhn and Tucker: the derivative of the expected error is the same at all lights in use, and no less at the others."""
     towards = directions[::17] + 0.05 * scattered(len(directions[::17]), 9)
@@ -86,7 +86,7 @@ def test_symmetric_lights_share_an_even_sky_equally(directions):
 
 
 @first_short("seed", range(3))
-@pytest.mark.parametrize("lights, part", [(cap(60, 180), 0.1), (None, 0.75)], ids=["even", "scattered"])
+@pytest.mark.parametrize("lights, part", [(lattice(60, 180), 0.1), (None, 0.75)], ids=["even", "scattered"])
 def test_shading_is_integrated_more_exactly_than_by_cells_and_smooth(lights, part, seed):
     """Truth: ∫ L (1 + n·ω)³ dω over the texels, for 20 normals. Scattered lights leave holes, whose light is shared as by smooth."""
     environment, normals = lobes(np.random.default_rng(seed)), scattered(20, seed + 9)
@@ -111,7 +111,7 @@ def test_a_sun_takes_no_light_from_the_sky(times):
     """Matt normals that face away from a sun of so many times the irradiance of an even sky: a sixth to a half of the light was left to
     them at 50 times, none at 500. The bounds are those of 96 lights in place of all directions: 8 % of the sky, and what lights on both
     sides of a shadow line let through, 1/1500 of the sun."""
-    directions, normals = cap(96, 180), scattered(400, 7)
+    directions, normals = lattice(96, 180), scattered(400, 7)
     environment = np.ones((90, 180, 3))
     environment[30, 50] += times * np.pi / texel_solid_angles(90, 180)[30, 0]
     away = normals[normals @ texel_directions(90, 180)[30, 50] < -0.3]
@@ -129,7 +129,7 @@ def test_layers_end_where_there_is_light_on_both_sides():
     np.testing.assert_allclose(layer_parts(steradians * radiance, steradians), np.ones((4, 1)), rtol=ROUNDING)
 
 
-@pytest.mark.parametrize("directions", [cap(128, 180), scattered(128, 4), DOME], ids=["even", "scattered", "dome"])
+@pytest.mark.parametrize("directions", [lattice(128, 180), scattered(128, 4), DOME], ids=["even", "scattered", "dome"])
 @first_short("environment", [lobes(np.random.default_rng(7), 100, 200), np.ones((90, 180, 3)) + sun(90, 180, 30, 50, 5e3)])
 def test_a_map_is_cut_finely_enough(directions, environment):
     """Truth: every texel by itself, in the same layers."""
@@ -160,7 +160,7 @@ def test_turning_the_map_is_turning_the_lights_back():
 
 
 def test_weights_of_a_frame_do_not_depend_on_other_frames():
-    environment, directions = lobes(np.random.default_rng(1)), cap(96, 180)
+    environment, directions = lobes(np.random.default_rng(1)), lattice(96, 180)
     rotations = np.stack([rotation_about_y(15.0 * k) for k in range(6)])
     whole = integrate_kernel(environment, directions, rotations)
     for frame in range(6):

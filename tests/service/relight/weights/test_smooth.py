@@ -9,10 +9,10 @@ from kernels.relight.weights.smooth import locate
 from service.relight.weights.triangulation import triangulate_sphere
 from service.relight.weights.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, icosahedron, ring, scattered, sun, turn
-from tests.kernels.scenes import cap
 from tests.marks import first_short
 from tests.reference import relight as reference
 from tests.reference.relight import rotation_about, texel_directions, texel_solid_angles
+from tests.reference.sampling import lattice
 
 HALF_DEGREE = 360, 720
 """A map whose texels are one sample each."""
@@ -83,7 +83,7 @@ def test_what_comes_from_below_a_dome_goes_to_its_rim(at, device):
     np.testing.assert_allclose(shares(DOME, at=at, device=device), expected / (abs(x) + abs(y) + abs(z)), atol=SHARE)
 
 
-@pytest.mark.parametrize("direction", [cap(60, 180), scattered(40, 7), STAGE, cap(96, 90), cap(331, 60)],
+@pytest.mark.parametrize("direction", [lattice(60, 180), scattered(40, 7), STAGE, lattice(96, 90), lattice(331, 60)],
                          ids=["even", "any", "rings", "half", "front"])
 def test_a_sun_at_a_light_is_its_own(direction, device):
     for light in range(0, len(direction), 7):
@@ -92,7 +92,8 @@ def test_a_sun_at_a_light_is_its_own(direction, device):
         np.testing.assert_allclose(share[0], np.arange(len(direction)) == light, atol=1e-5)
 
 
-@first_short("direction", [icosahedron(), cap(60, 180), scattered(80, 2), CUBE, RINGS], ids=["icosahedron", "even", "any", "cube", "rings"])
+@first_short("direction", [icosahedron(), lattice(60, 180), scattered(80, 2), CUBE, RINGS],
+             ids=["icosahedron", "even", "any", "cube", "rings"])
 def test_shares_reproduce_the_direction(direction, device):
     """Σ share · light points at the sun, within a polygon too, because its imaginary light is in the middle of its corners."""
     for seed in range(20):
@@ -133,8 +134,8 @@ def test_a_sun_of_one_texel_is_never_lost(data, rows, seed, count, axis, spread)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("direction", [DOME, STAGE, RINGS, cap(96, 90), cap(331, 60), scattered(50, 3), cap(4, 50), cap(50, 20)],
-                         ids=["dome", "stage", "rings", "half", "front", "any", "four in front", "narrow"])
+@pytest.mark.parametrize("direction", [DOME, STAGE, RINGS, lattice(96, 90), lattice(331, 60), scattered(50, 3), lattice(4, 50),
+                                       lattice(50, 20)], ids=["dome", "stage", "rings", "half", "front", "any", "four in front", "narrow"])
 def test_a_sun_moves_without_a_jump_also_where_lights_are_missing(direction, device):
     """Steps a tenth as wide change the shares a tenth as much, or a little more at folds; a jump would stay."""
     for seed in range(4):

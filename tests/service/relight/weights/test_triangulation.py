@@ -4,16 +4,16 @@ from scipy.spatial import ConvexHull
 
 from service.relight.weights.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 from tests.scenes.in_front import unit
 
 LAYOUTS = {
     "tetrahedron": CUBE[[0, 3, 5, 6]], "octahedron": AXES, "cube": CUBE, "icosahedron": icosahedron(), "dodecahedron": dodecahedron(),
     "rings": np.concatenate([ring(24, e) for e in (-75, -45, -15, 15, 45, 75)]),
     "rings and poles": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]),
-    "dome": np.concatenate([AXES[[1]], *(ring(24, e) for e in (0, 20, 40, 60))]), "even": cap(500, 180), "half": cap(96, 90),
-    "front": cap(331, 60), "a ring and one": np.concatenate([ring(36, 0), AXES[[1]]]), "four in front": cap(4, 50),
-    "two heaps": np.concatenate([cap(10, 5), -cap(10, 5)]), "near rings": np.concatenate([ring(19, 0), ring(19, 3)]),
+    "dome": np.concatenate([AXES[[1]], *(ring(24, e) for e in (0, 20, 40, 60))]), "even": lattice(500, 180), "half": lattice(96, 90),
+    "front": lattice(331, 60), "a ring and one": np.concatenate([ring(36, 0), AXES[[1]]]), "four in front": lattice(4, 50),
+    "two heaps": np.concatenate([lattice(10, 5), -lattice(10, 5)]), "near rings": np.concatenate([ring(19, 0), ring(19, 3)]),
     "any": scattered(300, 4), "any five": scattered(5, 0),
 }
 """Regular ones, so that many lights lie on one circle; ones with holes; and ones on one side."""
@@ -63,7 +63,7 @@ def test_triangles_are_the_convex_hull(count, seed):
 
 @pytest.mark.parametrize("direction, imaginary", [
     (AXES, []), (icosahedron(), []), (CUBE, AXES), (dodecahedron(), icosahedron()[:, ::-1]),
-    (np.concatenate([ring(24, 0), AXES[[1]]]), AXES[[4]]), (cap(20, 180), []),
+    (np.concatenate([ring(24, 0), AXES[[1]]]), AXES[[4]]), (lattice(20, 180), []),
 ], ids=["octahedron", "icosahedron", "cube", "dodecahedron", "dome", "all around"])
 def test_where_imaginary_lights_are(direction, imaginary):
     """In the middle of a square or pentagon, and below a dome; each shared out evenly over the corners."""
@@ -83,7 +83,7 @@ def test_the_middle_of_a_polygon_lies_in_its_plane():
 @pytest.mark.parametrize("count, largest", [(96, 90), (200, 120), (331, 145)])
 def test_a_hole_has_one_imaginary_light_in_its_middle(count, largest):
     """Behind the cap that the lights fill."""
-    direction = cap(count, largest)
+    direction = lattice(count, largest)
     got = triangulate_sphere(direction)
     behind = got.share[count:][got.vertex[count:, 2] < -0.95]
     assert len(behind) == 1

@@ -13,16 +13,16 @@ from service.relight.weights.weighting import integrate, light_weights
 from service.requests.relight import LightWeights
 from stage.transforms import rotation_about, rotation_about_y
 from tests.kernels.relight.lights import AXES, STILL, turn
-from tests.kernels.scenes import cap
 from tests.marks import first_short
 from tests.reference.relight import texel_solid_angles
+from tests.reference.sampling import lattice
 
 
 def test_the_weightings_differ_and_agree_in_sum(device):
     environment = np.random.default_rng(0).random((9, 18, 3))
-    kernel, cells, smooth = (integrate(environment, cap(20, 180), STILL, weighting=w, device=device)[0] for w in LightWeights)
-    np.testing.assert_array_equal(kernel, integrate_kernel(environment, cap(20, 180), STILL)[0])
-    np.testing.assert_array_equal(cells, integrate_cells(environment, cap(20, 180), STILL, device=device).energy[0])
+    kernel, cells, smooth = (integrate(environment, lattice(20, 180), STILL, weighting=w, device=device)[0] for w in LightWeights)
+    np.testing.assert_array_equal(kernel, integrate_kernel(environment, lattice(20, 180), STILL)[0])
+    np.testing.assert_array_equal(cells, integrate_cells(environment, lattice(20, 180), STILL, device=device).energy[0])
     for one, other in ((kernel, cells), (cells, smooth), (smooth, kernel)):
         assert np.abs(one - other).max() > 0.01
         np.testing.assert_allclose(one.sum(axis=0), other.sum(axis=0), rtol=1e-12)
@@ -37,7 +37,7 @@ def test_weights_place_the_whole_energy(count, seed, weighting):
     environment, irradiance = rng.gamma(0.5, 2.0, (10, 20, 3)), rng.uniform(0.1, 5, (count, 3))
     scale = np.zeros(-(-count // 8) * 8, dtype=np.float32)
     scale[:count] = 2.0 ** rng.integers(-5, 5, count)
-    given = integrate(environment, cap(count, 180), np.stack([np.eye(3), turn(7)]), weighting=weighting, device="cpu")
+    given = integrate(environment, lattice(count, 180), np.stack([np.eye(3), turn(7)]), weighting=weighting, device="cpu")
     weights = light_weights(given, irradiance, scale)
     assert weights.shape == (2, 3, len(scale)) and weights.dtype == np.float32 and (weights[:, :, count:] == 0).all()
     total = (environment * texel_solid_angles(10, 20)[..., None]).sum(axis=(0, 1))
@@ -103,7 +103,7 @@ def test_turns_by_whole_columns_are_found_once(rotations, searches):
 
 @first_short("weighting", list(LightWeights))
 def test_shared_turns_give_the_sums_of_single_ones(weighting, device):
-    rotations, lights = spin(48), cap(40, 180)
+    rotations, lights = spin(48), lattice(40, 180)
     whole = integrate(SKY, lights, rotations, weighting=weighting, device=device)
     for frame in (0, 1, 5, 24, 47):
         single = integrate(SKY, lights, rotations[frame][None], weighting=weighting, device=device)

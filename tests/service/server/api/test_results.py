@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from service.server.api import results as routes
 from service.server.api.problems import ApiError
-from service.server.api.results import _names, _part
+from service.server.api.results import asked_range, tag_matches
 from service.server.base.settings import Settings
 from service.server.storage.folder import FolderStorage, OpenFile
 from stage.errors import StorageError
@@ -284,6 +284,6 @@ def test_names_with_tricks_never_reach_the_storage(tmp_path):
 @given(st.text())
 def test_any_range_and_any_tag_can_be_said(text):
     with suppress(ApiError):
-        part = _part(text, OpenFile("x.bin", 0, 10, 0.0, "a"))
+        part = asked_range(text, OpenFile("x.bin", 0, 10, 0.0, "a"))
         assert part is None or 0 <= part.start < part.stop <= 10
-    assert _names(text, '"a"', strong=True) <= _names(text, '"a"', strong=False)
+    assert tag_matches(text, '"a"', strong=True) <= tag_matches(text, '"a"', strong=False)

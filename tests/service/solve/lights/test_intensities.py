@@ -8,8 +8,8 @@ from scipy.ndimage import gaussian_filter
 
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
-from tests.kernels.scenes import cap
 from tests.reference import microfacet as twin
+from tests.reference.sampling import lattice
 from tests.scenes import captures
 
 LIGHTS = 40
@@ -24,7 +24,7 @@ def solved(folder, factor, method="svbrdf", rough=None, **options):
     """
     count = len(factor)
     scene = captures.make_scene(28, count)
-    directions, ones = cap(count, 60.0 if rough is None else 85.0), np.ones((count, 3))
+    directions, ones = lattice(count, 60.0 if rough is None else 85.0), np.ones((count, 3))
     lobe = twin.diffuse(scene.normal, directions[:, None, None], np.array([0.0, 0.0, 1.0]), rough)
     scene = scene._replace(directions=directions, irradiance=ones,
                            images=scene.albedo * (lobe * factor[:, None, None])[..., None])
@@ -70,7 +70,7 @@ def test_what_the_first_estimate_leaves_is_refined_with_lobes(tmp_path, monkeypa
     assert report["found"]["light_intensities"]["used"] == "declared"
     told = report["found"]["light_factors"]
     assert told["believed"] and told["left_out_gain"] > 0.3
-    untold = np.stack([np.ones(LIGHTS), cap(LIGHTS, 60.0)[:, 2]], axis=1)
+    untold = np.stack([np.ones(LIGHTS), lattice(LIGHTS, 60.0)[:, 2]], axis=1)
     assert missed(told["factors"], factor, untold).std() < 0.2 * np.log(factor).std()  # normals have followed the wrong intensities
     assert np.median(error) < 0.6, np.median(error)
 
@@ -138,7 +138,7 @@ def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_
     """A highlight of a plane is alike in all of its pixels, as a brighter light is: normals of a wall and of the matt ball before it were
     8° off, and sure. Where lights are wrong beside it, that is said, and σ holds it."""
     count, side = 12, 48
-    directions = cap(count, 47.0)
+    directions = lattice(count, 47.0)
     y, x = np.mgrid[1:-1:side * 1j, -1:1:side * 1j]
     ball = (x**2 + y**2 < 0.5**2)[..., None]
     z = np.sqrt(np.maximum(0.5**2 - x**2 - y**2, 0))
@@ -154,7 +154,7 @@ def test_a_glossy_plane_asks_for_lights_that_what_stands_before_it_does_not(tmp_
 @pytest.mark.long
 def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path):
     """Most of the picture is one plane, which shades alike under any lights; what is left are 0.2 % of noise and the ball's rim."""
-    directions, (y, x) = cap(12, 47.0), np.mgrid[1:-1:48j, -1:1:48j]
+    directions, (y, x) = lattice(12, 47.0), np.mgrid[1:-1:48j, -1:1:48j]
     z = np.sqrt(np.maximum(0.7**2 - x**2 - y**2, 0))
     normal = np.where(z[..., None] > 0, np.stack([x, y, z], axis=-1) / 0.7, [0.0, 0.0, 1.0])
     factor = np.exp(np.random.default_rng(3).normal(0, 0.3, 12))
@@ -168,7 +168,7 @@ def test_a_body_before_a_wall_tells_the_lights_though_the_wall_does_not(tmp_path
 def test_highlights_of_a_relief_are_not_taken_for_lights_and_its_shading_tells_them(tmp_path, degrees, gloss, wrong):
     """As of a varnished picture: its normals were 22 to 29° off, by up to 61 σ, under right lights."""
     count, side = 12, 48
-    directions = cap(count, 50.0)
+    directions = lattice(count, 50.0)
     rough = gaussian_filter(np.random.default_rng(1).normal(size=(side, side)), 2)
     down, across = np.array(np.gradient(rough)) * np.tan(np.radians(degrees)) / np.hypot(*np.gradient(rough)).std()
     normal = np.stack([0.15 - across, down, np.ones_like(rough)], axis=-1)

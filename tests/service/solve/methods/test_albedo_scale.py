@@ -8,8 +8,8 @@ import pytest
 from service.requests.solve import SolveRequest
 from service.solve.methods.shadow_light import fit_albedo_scale, shown_bounce
 from service.solve.solve import solve
-from tests.kernels.scenes import cap
 from tests.reference.groove import Groove, Trough
+from tests.reference.sampling import lattice
 from tests.scenes.captures import distant, write_lit
 
 pytestmark = pytest.mark.long
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.long
 
 def shadows(groove: Groove, *, albedo: float, scale: float, stray: float = 0.0, noise: float = 0.0):
     """What fit_albedo_scale takes, under lights that are declared `scale` times too bright, with the true form factors."""
-    lights = cap(48, 75.0)
+    lights = lattice(48, 75.0)
     whole, _ = groove.radiance(lights, albedo)
     rng = np.random.default_rng(3)
     seen = (whole + albedo * stray) / scale + noise * rng.normal(size=whole.shape) / np.pi
@@ -90,7 +90,7 @@ ALBEDO, SCALE, SIDE = 0.8, 2.5, 28
 
 def groove_capture(folder, *, scale: float, declared: str | None, bounced: bool = True, widest: float = 70.0):
     """A groove, with all bounces or none, under 40 lights whose irradiance is declared `scale` times too large."""
-    lights = cap(40, widest)
+    lights = lattice(40, widest)
     whole, direct = Groove(SIDE).radiance(lights, ALBEDO)
     return write_lit(folder, (whole if bounced else direct).reshape(-1, SIDE, SIDE), [distant(light, scale) for light in lights],
                      camera={"projection": "orthographic", "resolution": [SIDE, SIDE]},
@@ -181,7 +181,7 @@ def test_sigma_holds_a_strength_that_no_shadow_tells(tmp_path):
 def test_lit_readings_tell_a_larger_strength(tmp_path):
     """Half as much light again as albedo and form factors let expect, as gloss adds it, under lights whose shadows decide nothing: with a
     strength of 1 the normals of the trough are 3.4° off in the mean, with that of the lit readings 2.3°."""
-    trough, lights = Trough(SIDE, 1.6), cap(24, 48.0)
+    trough, lights = Trough(SIDE, 1.6), lattice(24, 48.0)
     whole, direct = trough.radiance(lights, 0.6)
     images = (direct + 1.5 * (whole - direct)).reshape(-1, SIDE, SIDE)
     write_lit(tmp_path, images, [distant(light, 1.0) for light in lights],

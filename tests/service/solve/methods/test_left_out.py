@@ -8,12 +8,12 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.methods.support import SHARED, is_supported, leave_out, simpler_normals
 from service.solve.solve import solve
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
-from tests.kernels.scenes import cap
 from tests.reference import microfacet as twin
+from tests.reference.sampling import lattice
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, rgb, write_exr
 
-LIGHTS = cap(12, 42.0)
+LIGHTS = lattice(12, 42.0)
 """Few frontal lights, as of hand-held captures."""
 SUPPORTED = 0.7
 """Ratio of misfits above which the solve falls back to a prior where Lambert's law describes the object."""
@@ -42,7 +42,7 @@ def test_errors_of_lights_predict_nothing(device):
 def test_noise_in_shadows_is_predicted_by_middle_ranks(device):
     """Least squares takes what noise leaves in shadows for light; left-out readings say so, and that what is left is noise."""
     rng = np.random.default_rng(7)
-    normal, lights = tilted(192, 55.0), cap(16, 75.0)
+    normal, lights = tilted(192, 55.0), lattice(16, 75.0)
     radiance = render(normal, f0=None, lights=lights)
     radiance = np.abs(radiance + 0.02 * radiance.mean() * rng.normal(size=radiance.shape))
     samples, _ = sample(radiance, device, lights=lights)
