@@ -49,20 +49,23 @@ class Shapes(NamedTuple):
     """The mean cost of each shape."""
 
 
-def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape | None = None) -> Shapes:
+def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape | None = None,
+                      short_tails: bool | None = None) -> Shapes:
     """Choose the shape of the lobes from some hundreds of pixels, spread over the object; waits for the device.
 
-    `start` is [n, 3] unit normals to begin from. `beside` is a further shape that is tried.
+    `start` is [n, 3] unit normals to begin from. `beside` is a further shape that is tried. `short_tails`: whether highlights have them;
+    None: these pixels tell.
     """
-    first = find_normals(samples, start, shape=LobeShape(), sweep=QUICK).best
+    first = find_normals(samples, start, shape=LobeShape(short_tails=short_tails is True), sweep=QUICK).best
 
     def cost_of(shape: LobeShape) -> float:
         found = descend(samples, first.normal, shape=shape, weights=first.weights, schedule=FROM_LAMBERT)
         return float(np.mean(found.cost, dtype=np.float64))
 
-    short_tails = cost_of(LobeShape(short_tails=True)) < SHORT * float(np.mean(first.cost, dtype=np.float64))
-    if short_tails:
-        first = find_normals(samples, start, shape=LobeShape(short_tails=True), sweep=QUICK).best
+    if short_tails is None:
+        short_tails = cost_of(LobeShape(short_tails=True)) < SHORT * float(np.mean(first.cost, dtype=np.float64))
+        if short_tails:
+            first = find_normals(samples, start, shape=LobeShape(short_tails=True), sweep=QUICK).best
     tried: dict[LobeShape, float] = {} if beside is None else {beside: cost_of(beside)}
 
     def judge(rough: float, slope: float) -> None:

@@ -57,6 +57,11 @@ class ArrivingLight(NamedTuple):
         total = np.sum(shares, axis=0)
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
 
+    def mean_at(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Return the mean over all lights and channels of the light that arrives at n pixels, [n]."""
+        corners, shares = self.at(rows, cols)
+        return (np.asarray(self.light).mean(axis=(1, 2))[corners] * shares).sum(axis=1)
+
 
 def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
     """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.

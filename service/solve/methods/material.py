@@ -38,6 +38,7 @@ from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import Solution, SolveInput, half, raise_error
 from service.solve.height.direct_light import DirectLight, direct_light
+from service.solve.height.interreflection import ArrivingLight
 from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
@@ -51,6 +52,10 @@ SHARED_PAIRS = 384
 """Pairs of neighbouring pixels, spread over the object, from which the part of the misfit that they share is measured."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
+
+CLEAR = 0.3
+"""Part of the solved pixels, those at which the least bounced light arrives, that tell the shape of the lobes once that light is known:
+with it normals of 21 path-traced folds are 2.14° off in the mean, with half of them 2.20°, and with the shape of the whole readings 2.38°."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +166,14 @@ class _Walk:
             support = support_of(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
             self._supported, self._pull, self._simpler = support.lobes, support.pull, support.simpler
             self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
-        samples, normal = self._read(self._spread, light), self.result.normal[:, self._spread].T
         if self._supported:
-            shapes = choose_lobe_shape(samples, normal)
-            self._shape, self._lobe = shapes.mean, shapes.best
-            self.result.facts |= {**lobe_report(self._lobe), "shapes_tried": len(shapes.tried)}
+            self._shape_of(self._spread, light)
+
+    def _shape_of(self, pixels: np.ndarray, light: DirectLight | None, short_tails: bool | None = None) -> None:
+        """Choose the shape of the lobes from some pixels; `short_tails` as of `choose_lobe_shape`."""
+        shapes = choose_lobe_shape(self._read(pixels, light), self.result.normal[:, pixels].T, short_tails=short_tails)
+        self._shape, self._lobe = shapes.mean, shapes.best
+        self.result.facts |= {**lobe_report(self._lobe), "shapes_tried": len(shapes.tried)}
 
     def search(self) -> None:
         """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
@@ -188,7 +196,8 @@ class _Walk:
                                                 (self._shape, self._lobe, self._supported)))
 
     def direct_light(self) -> DirectLight | None:
-        """Find what the object does to its own light, from the first search; None when no pixel is solved."""
+        """Find what the object does to its own light, from the first search, and the shape of the lobes again from where little light
+        bounces; None when no pixel is solved."""
         solved = self._solved
         material = Material(self.result.albedo.copy(), self._specular.copy(), self._roughness.copy())
         light = direct_light(self._given, self._lights, self._field, self.result.normal, material, self._bouncing, solved,
@@ -196,11 +205,19 @@ class _Walk:
                              parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or not self._options.settling:
             return light
+        if self._supported and self._field is None:
+            self._shape_of(self._clear(light.arriving), light, self._shape.short_tails)
         relative = self._given.relative and self._options.scale
         settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
         self._unknown_bounce = settled.degrees
         self.result.facts |= settled.report(relative=relative)
         return settled.light
+
+    def _clear(self, arriving: ArrivingLight) -> np.ndarray:
+        """Return LOBE_PIXELS of the pixels, spread over the object, at which little bounced light arrives."""
+        amount = arriving.mean_at(*np.divmod(self._solvable, self._given.camera.width))
+        clear = self._solvable[amount <= np.quantile(amount, CLEAR)]
+        return clear[evenly(len(clear), LOBE_PIXELS)]
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:
         """Replace the intensities of the lights where the object shows that others explain it better; returns the direct light of them."""
