@@ -151,9 +151,10 @@ def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
 
 @pytest.mark.long
 def test_maps_that_were_solved_with_other_lights_guide_and_are_exported_with_a_warning(relit, scene, tmp_path):
-    """Lights that were corrected in the manifest after the solve; beside it the same lights."""
+    """Lights that were corrected in the manifest after the solve; beside it the same lights, of an irradiance that the solve scaled."""
     folder = shutil.copytree(scene[0], tmp_path / "scene")
-    assert relit("solve", folder / "cap", "--method", "lambert", "--out", folder / "solved").code == 0
+    edit_manifest(folder / "cap", irradiance_scale="relative")
+    assert relit("solve", folder / "cap", "--method", "lambert", "--albedo-scale", "2", "--out", folder / "solved").code == 0
     words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--maps", folder / "solved")
     asset = ("export", folder / "solved", "--rig", folder / "cap", "--out", tmp_path / "a.usda")
     assert "other lights" not in relit(*words, "--out", tmp_path / "a.#.exr").out + relit.done(*asset).out
