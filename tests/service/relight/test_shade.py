@@ -179,6 +179,8 @@ def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
     outcome = relit("shade", tmp_path / "maps", "--light", text([0.5, 0.5, 10], [100] * 3), "--out", tmp_path / "p.exr")
     assert "places of lights are taken in pixels" in outcome.out
     np.testing.assert_allclose(rgb(tmp_path / "p.exr")[2, 3], 0.5 / np.pi, rtol=1e-3)
+    sky = write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))  # which has no place
+    assert "in pixels" not in relit.done("shade", tmp_path / "maps", "--environment", sky, "--out", tmp_path / "s.exr").out
 
 
 @pytest.mark.parametrize(("options", "words"), [
