@@ -61,7 +61,7 @@ def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[s
     over = np.where(part > 0, (0.35 + 0.65 * part) * np.array(RED), mean.mean(axis=-1, keepdims=True) * 0.5)
     mask = f"mask: {100 * views.mask.mean():.3g} % inside", np.where(inside, mean, 0.35 * mean + 0.25 * np.array((0.1, 0.3, 0.6)))
     saturated = f"saturated: {100 * hit.mean():.3g} % of the object", over
-    histogram = f"readings from {unit * 2.0 ** STOPS[0]:.3g} to {unit * 2.0 ** STOPS[1]:.3g}", _histogram(views.counts)
+    histogram = f"readings, log, {unit * 2.0 ** STOPS[0]:.3g} to {unit * 2.0 ** STOPS[1]:.3g}", _histogram(views.counts)
     directions = _directions(capture)
     if directions:
         dome = f"lights as the camera sees them, {RING_DEGREES} degrees from ring to ring", _dome(capture, images, directions, suspects)
@@ -162,9 +162,9 @@ def _dome(capture: Capture, images: Sequence[np.ndarray], directions: Mapping[st
 
 
 def _title(frame: Frame, image: np.ndarray) -> str:
-    """Return what is written above a frame, cut to its width."""
+    """Return what is written above a frame, as much of its end as its width has room for: names of frames begin alike."""
     words = frame.image.rsplit("/", 1)[-1] + (f", {frame.pattern.describe()}" if frame.pattern is not None else "")
-    return words[:max(4, TILE * image.shape[1] // image.shape[0] // 8)]
+    return words[-max(4, TILE * image.shape[1] // image.shape[0] // 8):]
 
 
 def _histogram(counts: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from stage.folders import advice
 from stage.formats.images import read_header
 from stage.formats.ply import POINTS_FILE, PointCloud, read_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps, capture_as_solved
 from stage.stack.fingerprint import combined, digest
 
 OPTIONS = ("rig", "environment", "card")
@@ -100,7 +100,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
 def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Timings) -> Exported:
     maps = SurfaceMaps.read(path, layers=EXPORTED_LAYERS)
-    around = _open_surroundings(request, maps)
+    around = _open_surroundings(request, maps, path)
     contents = {path.stem: digest(path), **_content_hashes(around)}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
@@ -174,10 +174,10 @@ def _refuse_surroundings(request: ExportRequest) -> None:
         raise RequestError(f"{given}: lights and frames go with solved maps, into a .usdz, .usda or .usdc: leave the option out")
 
 
-def _open_surroundings(request: ExportRequest, maps: SurfaceMaps) -> Surroundings:
-    """Open and check what the asset brings along; the lights of the rig are those under which its albedo looks as the images do."""
+def _open_surroundings(request: ExportRequest, maps: SurfaceMaps, path: Path) -> Surroundings:
+    """Open and check what the asset brings along, of which the rig is the capture as its maps at this path were solved."""
     camera = maps.camera
-    rig = None if request.rig is None else Capture.open(request.rig, request.pixels).with_brighter_lights(1 / maps.albedo_scale)
+    rig = None if request.rig is None else capture_as_solved(Capture.open(request.rig, request.pixels), path)
     if rig is not None and rig.camera != camera:
         differs = [name for name, value in rig.camera if value != getattr(camera, name)]
         raise RequestError(f"--rig {request.rig}: its camera differs from that of the maps in {', '.join(differs)}: "

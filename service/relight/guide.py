@@ -24,7 +24,7 @@ from kernels.images import ImagesOnDevice
 from kernels.packs import Band
 from kernels.relight.frames.halves import to_halves
 from kernels.relight.frames.near_sum import sum_near
-from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs, share_beyond
+from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs, share_beyond, trusted
 from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import sum_shown
 from kernels.relight.model.guide import compare_model, fit_trust, seen_lobes
@@ -94,6 +94,11 @@ class Guide:
     def trust_beyond(self) -> np.ndarray:
         """Return [n] β of the model's pixels for light from beyond the captured lights, 0…1."""
         return self._fit(partial(compare_beyond, pairs=inward_pairs(self._lights.direction)), None)
+
+    @cached_property
+    def least_beyond(self) -> float:
+        """Return the least β of what the model takes away there: that of the median pixel."""
+        return float(np.median(self.trust_beyond))
 
     def _fit(self, compare: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
         """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
@@ -171,7 +176,7 @@ class Guide:
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         chunk = self._range.chunk(lights, places)
         if chunk.beyond is not None:
-            _ = self.trust_beyond  # before several threads ask for it
+            _ = self.least_beyond  # before several threads ask for it
         done = 0
         for batch in self._model.batches():
             band = self.images.pick(batch.pixels)
@@ -202,7 +207,8 @@ class Guide:
         for batch in self._model.batches():
             def use(portion: Portion, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array, done: int = done) -> None:
                 part = slice(done + portion.pixels.start, done + portion.pixels.stop)
-                pixels = Pixels(portion.surface.values, self._model.positions[part], trust[part], beyond[part] if len(beyond) else beyond)
+                pixels = Pixels(portion.surface.values, self._model.positions[part], trust[part],
+                                *((beyond[part], self.least_beyond) if len(beyond) else (beyond, 0.0)))
                 light.correct(portion, pixels, facing, grid, captured, shown)
 
             self._range.light_on_device(batch, self.images.pick(batch.pixels), self.images.stack.scale, self._visible(batch), light.chunk,
@@ -224,7 +230,8 @@ class Guide:
     def _add(self, frames: np.ndarray, mirrored: np.ndarray | None, pixels: np.ndarray, part: slice, lit: LitModel) -> None:
         """Add the correction of some pixels to frames [frames, 3, pixels], and keep its specular part."""
         plain = frames[:, :, pixels]
-        change, mirror = correction(lit, plain, self.trust[part], None if lit.beyond is None else self.trust_beyond[part])
+        beyond = (None, 0.0) if lit.beyond is None else (self.trust_beyond[part], self.least_beyond)
+        change, mirror = correction(lit, plain, self.trust[part], *beyond)
         guided = np.maximum(plain + change, np.minimum(plain, 0))
         frames[:, :, pixels] = guided
         if mirrored is not None:
@@ -275,7 +282,8 @@ class Guide:
             mirror = wanted[1]
             if fine.any() or coarse.any():
                 wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(fine), near.coarse.scaled(coarse))
-                added = added + pictures + self.trust_beyond[part] * followed(wanted.sum(axis=0) - told, pictures, told)
+                added = added + pictures + trusted(followed(wanted.sum(axis=0) - told, pictures, told), self.trust_beyond[part],
+                                                     self.least_beyond)
                 mirror = mirror + wanted[1]
             added = np.maximum(added, 0)
             frame[:, batch.pixels] += added

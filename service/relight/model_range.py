@@ -16,7 +16,7 @@ from kernels.device import to_numpy
 from kernels.packs import Band
 from kernels.relight.directions.direction_grid import direction_grid
 from kernels.relight.directions.facing import facing_directions
-from kernels.relight.model.beyond import followed
+from kernels.relight.model.beyond import followed, trusted
 from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import ratio_of_sums
 from kernels.relight.model.responses import Responses, empty_responses, respond, shown_gloss
@@ -192,13 +192,15 @@ def _key(portion: Portion) -> tuple[int, int]:
     return int(portion.position[0]), len(portion.position)
 
 
-def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None,
+               least: float) -> tuple[np.ndarray, np.ndarray]:
     """Return what is added to frames, and the model's specular part of their light.
 
     Args:
         plain: [3, n] or [frames, 3, n] sums of captured images.
         trust: [n] β between the captured lights.
         trust_beyond: [n] β beyond them; not None where the model has such light.
+        least: the least β of what is taken away there.
     """
     mirror = model.gloss * model.ratio
     picture = np.maximum(model.whole, 0)  # what the model has in place of the sums
@@ -209,7 +211,7 @@ def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyo
     # what images have lost by a shadow that the model has elsewhere is not taken from them a second time
     change = trust * followed(model.matt + mirror - model.whole, np.minimum(plain, picture), picture)
     if model.beyond is not None and trust_beyond is not None:
-        change = change + trust_beyond * followed(model.beyond.whole - model.beyond.captured, plain, picture)
+        change = change + trusted(followed(model.beyond.whole - model.beyond.captured, plain, picture), trust_beyond, least)
         mirror = mirror + model.beyond.gloss
     if model.added is not None:
         mirror = mirror + model.added[..., 1, :, :]

@@ -35,7 +35,7 @@ from service.requests.shade import ShadeRequest
 from stage.capture.capture import Capture
 from stage.capture.lighting import lights_from_centre
 from stage.colour.radiance import clipping_sentences
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps, capture_as_solved
 from stage.results.matte import Matte
 from stage.results.result_metadata import result_file
 from stage.stack.brackets import merge_brackets
@@ -73,7 +73,7 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
         turn = request.turn_degrees
         environment = TurnedEnvironment(environments.path(1), turn, UPRIGHT, rotation_about_y(turn), 0.0)
     lighting = ScheduledFrame(1, environment, (), {}, request.exposure)
-    capture = None if request.capture is None else Capture.open(request.capture, request.pixels)
+    capture = None if request.capture is None else capture_as_solved(Capture.open(request.capture, request.pixels), path)
     if capture is None:
         maps = SurfaceMaps.read(path)
         frame, specular, warnings = _shade_maps(maps, path, lighting, environments, near, device, timings)

@@ -37,7 +37,7 @@ def contact_sheet(path: Path, frames: Sequence[Path], review: Review = AS_EVER) 
     shown = [frames[i] for i in np.linspace(0, len(frames), min(MOST_FRAMES, len(frames)), endpoint=False).astype(int)]
     tiles = []
     for frame in shown:
-        pixels, space = read_frame(frame)
+        pixels, space = read_frame(frame, "RGBA")
         # in linear light, and before the display transform: that is the slow part
         tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space, review)))
     across = max(1, math.ceil(math.sqrt(len(tiles) * FRAME_TILE / max(tiles[0][1].shape[1], 1) * 16 / 9)))  # as wide as a screen
@@ -61,23 +61,24 @@ def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *,
         write_png(temporary, np.asarray(sheet.get_pixels(oiio.UINT8)), srgb=True, texts=colour_configuration())
 
 
-def read_frame(path: Path) -> tuple[np.ndarray, str]:
-    """Return the radiance of a relit frame, [rows, cols, 3] float32, and its colour space."""
+def read_frame(path: Path, wanted: str = "RGB") -> tuple[np.ndarray, str]:
+    """Return the wanted channels that a relit frame has, [rows, cols, channels] float32, and its colour space."""
     channels, metadata = exr.read(path)
-    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
+    return np.stack([channels[c] for c in wanted if c in channels], axis=-1).astype(np.float32), exr.color_space_of(metadata)
 
 
 def display(pixels: np.ndarray, space: str, review: Review = AS_EVER) -> np.ndarray:
     """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through a view of OpenColorIO.
 
-    Black becomes the background of a sheet.
+    The background of a sheet is behind what a fourth channel, the matte of premultiplied pixels, does not cover; without it, behind black.
     """
-    lit = pixels.any(axis=-1)
-    shown = np.empty(pixels.shape, dtype=np.float32)
-    shown[~lit] = BACKGROUND
+    colour, matte = np.split(pixels, [3], axis=-1)
+    covered = np.clip(matte, 0, 1) if matte.size else np.float32(1) * (colour.max(axis=-1, keepdims=True) > 0)
+    shown = (1 - covered) * BACKGROUND
+    lit = covered[..., 0] > 0
     if lit.any():  # the transform takes a microsecond a pixel, and most of an object's picture is black
-        shown[lit] = through_view(pixels[lit][None], space, review)[0]
-    return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
+        shown[lit] += through_view(colour[lit][None], space, review)[0]
+    return shown
 
 
 def exposure_of(images: np.ndarray, mask: np.ndarray) -> float:
@@ -94,13 +95,13 @@ def display_gain(readings: np.ndarray) -> float:
 
 
 def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarray:
-    """Return an image [rows, cols, 3] scaled to a height; `kernel` is OpenImageIO's name of a filter, by default one that may ring."""
-    rows, cols = image.shape[:2]
+    """Return an image [rows, cols, channels] scaled to a height; `kernel`: OpenImageIO's name of a filter, by default one that may ring."""
+    rows, cols, channels = image.shape
     if rows == height:
         return image
     width = max(1, round(cols * height / rows))
     source = oiio.ImageBuf(np.ascontiguousarray(image, dtype=np.float32))
-    return pixels_of(oiio.ImageBufAlgo.resize(source, kernel, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
+    return pixels_of(oiio.ImageBufAlgo.resize(source, kernel, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, channels)))
 
 
 def dome_places(directions: np.ndarray, *, side: int, reach: float, widest_degrees: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from service import __version__
 from service.requests.base.base import Options, Role
 from service.requests.base.options import role_of
 from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Manifest, read_manifest
 from stage.colour.configuration import current
 from stage.errors import ResultError
 from stage.results.maps import SurfaceMaps
@@ -92,16 +93,16 @@ def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str 
             "hashed images otherwise, so that nothing tells whether they are those of the capture: solve it again if in doubt")
 
 
-def hash_of_lights(capture: Capture) -> str:
+def hash_of_lights(manifest: Manifest) -> str:
     """Return the content hash of the lights that a manifest declares, frame by frame."""
-    declared = [None if frame.light is None else frame.light.model_dump(mode="json") for frame in capture.manifest.frames]
+    declared = [None if frame.light is None else frame.light.model_dump(mode="json") for frame in manifest.frames]
     return hashlib.sha256(json.dumps(declared).encode()).hexdigest()
 
 
 def other_manifest(maps: SurfaceMaps, capture: Capture, path: Path) -> str | None:
     """Return the sentence for maps, read from a path, of a capture whose manifest had another camera or other lights; None: the same."""
     differs = [f"another camera.{name}" for name, value in maps.camera if value != getattr(capture.camera, name)]
-    lights = hash_of_lights(capture)
+    lights = hash_of_lights(read_manifest(capture.folder / FILE_NAME))  # as declared: a capture as solved has brighter lights
     differs += ["other lights"] if maps.provenance.get(LIGHTS, lights) != lights else []
     return None if not differs else (f"{path}: was solved with {', '.join(differs)} than the manifest of the capture has now: solve it "
                                      "again, or what the maps say does not fit the images")

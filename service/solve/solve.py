@@ -179,7 +179,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     solution.warnings += [outdated] if outdated else []
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
-    sources |= {HASHING: str(LAYOUT), LIGHTS: hash_of_lights(capture)}
+    sources |= {HASHING: str(LAYOUT), LIGHTS: hash_of_lights(capture.manifest)}
     sources |= {ALBEDO_SCALE: f"{albedo_scale:g}"} if albedo_scale != 1 else {}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)
     timings.stage("write", 1)

@@ -77,7 +77,10 @@ class Capture:
             if not folder.is_dir():
                 raise ManifestError(f"{folder}: there is no such folder")
             if not (folder / FILE_NAME).exists():
-                advised = advice(folder, "see `relit import` for data laid out another way")
+                steps = sorted(folder.glob(f"*/{FILE_NAME}"))
+                advised = advice(folder, "see `relit import` for data laid out another way" if not steps else
+                                 f"its folders do, such as {steps[0].parent}: name one; `relit solve`, `relit depth` and `relit relight` "
+                                 "take all of them as a sequence")
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: {advised}")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         headers = capture._check_files()

@@ -1,6 +1,6 @@
 """The solved surface maps of one capture, and their file, maps.exr."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -72,11 +72,6 @@ class SurfaceMaps:
     estimated: np.ndarray | None = None  # [rows, cols] bool, where values are kept though they may not count as solved; None: the mask
     color_space: str = "lin_rec709_scene"
     provenance: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def albedo_scale(self) -> float:
-        """The factor between the albedo of these maps and that under the lights of the capture."""
-        return _albedo_scale(self.provenance)
 
     def layers(self) -> dict[str, np.ndarray]:
         """Return the layers that were estimated by their names, in the order of the file."""
@@ -152,8 +147,4 @@ def capture_as_solved(capture: Capture, path: Path) -> Capture:
     found = camera_and_provenance(metadata, path, file_name=MAPS_FILE)[0].surface_z_m
     if found is not None and distance_is_missing(capture):
         capture = capture.at_distance(found)
-    return capture.with_brighter_lights(1 / _albedo_scale(metadata))
-
-
-def _albedo_scale(metadata: Mapping[str, object]) -> float:
-    return float(str(metadata.get(ALBEDO_SCALE, 1)))
+    return capture.with_brighter_lights(1 / float(str(metadata.get(ALBEDO_SCALE, 1))))

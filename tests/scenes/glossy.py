@@ -87,7 +87,7 @@ def write_lit(folder: Path, mask: np.ndarray, directions: np.ndarray, seen: Call
                        camera={"projection": "orthographic", "resolution": list(mask.shape[::-1]), "pixel_size_m": PIXEL_M})
 
 
-def write_maps(folder: Path, surface: Dome, camera: Camera | None = None, **changes: np.ndarray | str | None) -> Path:
+def write_maps(folder: Path, surface: Dome, camera: Camera | None = None, **changes: np.ndarray | str | dict[str, str] | None) -> Path:
     """Write the true maps, or changed ones, or those of another camera than the orthographic one of the capture."""
     folder.mkdir(parents=True)
     size = len(surface.mask)

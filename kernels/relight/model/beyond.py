@@ -75,6 +75,15 @@ def followed(change: np.ndarray, picture: np.ndarray, modelled_picture: np.ndarr
     return np.where(change < 0, change * np.maximum(share, 0), change)
 
 
+def trusted(change: np.ndarray, trust: np.ndarray, least: float) -> np.ndarray:
+    """Return a change […, n] of pictures times β [n], of losses at least the median β of the object.
+
+    In the highlights of the captured lights readings tell of these alone, and little trust left them as lit patches on dark sides. A loss
+    is a share of the picture, and safer than a gain.
+    """
+    return np.where(change < 0, np.maximum(trust, least), trust) * change
+
+
 def compare_beyond(captured: Captured, pairs: np.ndarray) -> wp.array:
     """Compare the model's changes from light to light with those of the captured images.
 

@@ -53,6 +53,8 @@ class Pixels(NamedTuple):
     position: wp.array  # [n] int32 in the image
     trust: wp.array  # [n] float32
     trust_beyond: wp.array  # [n] float32; [0] where nothing lies beyond the captured lights
+    least_beyond: float
+    """The least trust there in what the model takes away (kernels.relight.model.beyond.trusted)."""
 
 
 def correct_frames(frames: FramesOnDevice, places: wp.array, begin: int, sums: FrameSums, small: wp.array, pixels: Pixels) -> None:
@@ -80,6 +82,7 @@ def _correct_kernel(pack: int) -> Any:
                        position: wp.array(dtype=wp.int32),  # [n]
                        trust: wp.array(dtype=float),  # [n]
                        trust_beyond: wp.array(dtype=float),  # [n] or [0]
+                       least_beyond: float,
                        small: wp.array3d(dtype=lane_type),  # [F, 6, P], as the following that are not empty
                        matt: wp.array3d(dtype=lane_type),
                        gloss: wp.array3d(dtype=lane_type),
@@ -127,7 +130,8 @@ def _correct_kernel(pack: int) -> Any:
                         shine = beyond_gloss[f, c, p][k] + beyond_small[f, 3 + c, p][k]
                         outside = albedo[k] * beyond_matt[f, c, p][k] + beyond_small[f, c, p][k] + shine
                         gain = outside - inside
-                        change += trust_beyond[n] * wp.where(gain < 0.0, gain * share, gain)
+                        believed = trust_beyond[n]
+                        change += wp.where(gain < 0.0, wp.max(believed, least_beyond) * gain * share, believed * gain)
                         mirror += shine
                     guided = wp.max(plain + change, wp.min(plain, 0.0))
                     frames[row, c, at] = guided

@@ -108,7 +108,7 @@ def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) 
     print(f"picture  {result.path}")
     if request.display is not None:
         print(f"display  {request.display}")
-    if not result.metric:
+    if not result.metric and (request.light or request.sphere or request.rectangle):
         print("scale    the maps have none: places of lights are taken in pixels")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")

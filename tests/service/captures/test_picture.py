@@ -90,18 +90,21 @@ def test_saturation_is_red_where_it_is(tmp_path):
 
 @pytest.mark.long
 def test_frames_without_directions_are_in_their_order(tmp_path):
-    """Patterns; one that cannot be read is crossed in red."""
-    frames = [{"image": f"{i}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)]
+    """Patterns; one that cannot be read is crossed in red. Titles are cut to the width, but not what tells them apart."""
+    codes = [{"code": "gray", "axis": "column", "bit": i, "bits": 4} for i in range(4)]
+    frames = [{"image": f"{'begins-alike' * 4}{i}.exr", "pattern": codes[i]} for i in range(4)]
     for i in range(4):
-        write_exr(tmp_path / "cap" / f"{i}.exr", np.full((12, 16, 3), 0.2 * (i + 1)))
+        write_exr(tmp_path / "cap" / frames[i]["image"], np.full((12, 16, 3), 0.2 * (i + 1)))
     write_manifest(tmp_path / "cap", {"schema": "relit.capture/1", "name": "scan", "frames": frames,
                                       "camera": {"projection": "orthographic", "resolution": [16, 12]}})
     found, image = drawn(tmp_path / "cap", tmp_path / "a.png")
     assert found.faults == [] and not red(image).any()
     row, width = MARGIN + TITLE + TILE + GAP + TITLE + TILE // 2, TILE * 16 // 12 + GAP
     levels = [image[row, MARGIN + number * width + TILE // 2, 0] for number in range(4)]
+    titles = [image[row - TILE // 2 - TITLE:row - TILE // 2, MARGIN + number * width:][:, :width].tobytes() for number in range(4)]
+    assert len(set(titles)) == 4
     assert levels == sorted(levels) and len(set(levels)) == 4
-    write_exr(tmp_path / "cap" / "2.exr", np.full((12, 16, 3), np.nan))
+    write_exr(tmp_path / "cap" / frames[2]["image"], np.full((12, 16, 3), np.nan))
     found, image = drawn(tmp_path / "cap", tmp_path / "b.png")
     assert len(found.faults) == 1 and "2.exr" in found.faults[0]
     crossed = np.argwhere(red(image))

@@ -50,6 +50,12 @@ def test_folders_of_another_kind_are_named(relit, tmp_path, held, arguments, wor
     relit(*(part.format(folder) for part in arguments)).refused(words)
 
 
+def test_a_sequence_is_named_with_a_step(relit, tmp_path):
+    (tmp_path / "seq" / "s2").mkdir(parents=True)
+    (tmp_path / "seq" / "s2" / manifest.FILE_NAME).touch()
+    assert f"such as {tmp_path}/seq/s2" in relit.refused("info", tmp_path / "seq")
+
+
 @pytest.mark.parametrize("arguments", [("solve",), ("solve", "--method", "gradient"), ("solve", "--lights", "unknown")])
 def test_patterns_are_for_another_command(relit, tmp_path, arguments):
     command, *options = arguments

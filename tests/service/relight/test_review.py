@@ -77,6 +77,17 @@ def test_the_pictures_of_the_stage_have_them_too(reviews, tmp_path):
     assert len(reviews) >= 3 and set(reviews) == {WANTED}
 
 
+def test_the_background_of_a_sheet_is_behind_what_the_matte_leaves(tmp_path):
+    """Lossy compression leaves traces around an object, which were shown as black blocks; black that is covered is black. The frame has the
+    height of a tile, so that nothing is resampled; one code of 8 bits."""
+    frame = np.zeros((sheet.FRAME_TILE, 4, 4), np.float32)
+    frame[:, 0, :3], frame[:, 1, 3], frame[:, 2, 3] = 1e-5, 1, 0.5
+    sheet.contact_sheet(tmp_path / "s.png", [write_exr(tmp_path / "a.exr", frame)])
+    shown = oiio.ImageBuf(str(tmp_path / "s.png")).get_pixels(oiio.FLOAT)[sheet.MARGIN + sheet.TITLE + 1, sheet.MARGIN:][:4]
+    wanted = np.array([[1], [0], [0.5], [1]]) * sheet.BACKGROUND
+    np.testing.assert_allclose(shown, wanted, atol=1 / 255)
+
+
 def test_a_look_of_a_studios_configuration_is_in_the_sheet(relit, capture, tmp_path):
     """Half of the light of a look in closed form: 0.5 to the power of 1 / 2.5 of the values on the sheet."""
     config, image = minimal(tmp_path / "house.ocio"), Capture.open(capture).manifest.frames[0].image

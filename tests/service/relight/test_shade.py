@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stage.capture.camera import Camera
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import ALBEDO_SCALE, MAPS_FILE, SurfaceMaps
 from tests.reference import microfacet
 from tests.scenes.captures import files_in, rgb, write_exr
 from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, reflect, write_dome, write_maps
@@ -155,12 +155,15 @@ def test_an_even_environment_is_the_albedo(relit, tmp_path):
     np.testing.assert_allclose(middle, np.broadcast_to(ALBEDO, middle.shape), rtol=0.01)
 
 
-def test_a_far_point_light_in_the_place_of_a_captured_one_gives_its_image(relit, maps, tmp_path):
-    """With --capture the sum for light from a captured light is that light's image; 1 %: the point is at a finite distance."""
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_far_point_light_in_the_place_of_a_captured_one_gives_its_image(relit, tmp_path, scale):
+    """With --capture the sum for light from a captured light is that light's image; 1 %: the point is at a finite distance. Under an albedo
+    that its solve took as twice that of the declared lights, the lamp was half as bright."""
     directions = write_dome(tmp_path / "cap", SURFACE)
+    maps = write_maps(tmp_path / "maps", SURFACE, provenance={ALBEDO_SCALE: f"{scale}"})
     light = int(np.argmax(directions @ [0.3, 0.3, 0.9]))
     far = 1000.0
-    relit("shade", maps, "--capture", tmp_path / "cap", "--light", text(directions[light] * far, [2 * far**2] * 3), "--out",
+    relit("shade", maps, "--capture", tmp_path / "cap", "--light", text(directions[light] * far, [2 / scale * far**2] * 3), "--out",
           tmp_path / "p.exr")
     captured = rgb(tmp_path / "cap" / f"{light:03d}.exr")
     np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], captured[SURFACE.mask], rtol=0.01)
@@ -176,6 +179,8 @@ def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
     outcome = relit("shade", tmp_path / "maps", "--light", text([0.5, 0.5, 10], [100] * 3), "--out", tmp_path / "p.exr")
     assert "places of lights are taken in pixels" in outcome.out
     np.testing.assert_allclose(rgb(tmp_path / "p.exr")[2, 3], 0.5 / np.pi, rtol=1e-3)
+    sky = write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))  # which has no place
+    assert "in pixels" not in relit.done("shade", tmp_path / "maps", "--environment", sky, "--out", tmp_path / "s.exr").out
 
 
 @pytest.mark.parametrize(("options", "words"), [

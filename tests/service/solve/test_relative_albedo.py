@@ -36,7 +36,7 @@ def test_the_brightest_pixels_are_as_bright_as_paint_whatever_the_unit_of_the_li
 
 @pytest.mark.long
 def test_near_lights_in_large_units_are_relit_and_exported(relit, tmp_path):
-    """As near_ps has them: without the distance of the surface, which the solve finds and relight takes from the maps."""
+    """As near_ps has them: without the distance of the surface, which the solve finds and all that light its maps take from these."""
     scene = near_lights.dome(24, perspective=True)
     near_lights.write(tmp_path / "cap", scene, lamps(scene, 10, 1.5))
     data = json.loads((tmp_path / "cap" / "capture.json").read_text())
@@ -52,7 +52,11 @@ def test_near_lights_in_large_units_are_relit_and_exported(relit, tmp_path):
     frame = rgb(tmp_path / "f.1.exr")[maps.mask]
     # a surface under an even sky returns its albedo times the sky, less what lamps above the horizon alone do not light: a half to all
     assert 0.5 < np.median(frame / (0.5 * maps.diffuse_albedo[maps.mask])) < 1.2
-    assert "all over" not in relit.done("export", tmp_path / "cap" / "out", "--out", tmp_path / "a.usdz").out
+    told = relit.done("export", tmp_path / "cap" / "out", "--rig", tmp_path / "cap", "--out", tmp_path / "a.usdz").out
+    assert "all over" not in told and "other lights" not in told
+    picture = ("shade", tmp_path / "cap" / "out", "--environment", tmp_path / "sky.exr", "--capture", tmp_path / "cap")
+    assert "other lights" not in relit.done(*picture, "--out", tmp_path / "p.exr").out
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[maps.mask], frame, rtol=2e-3)  # half rounding; the frame is the same picture
 
 
 def test_absolute_lights_are_never_rescaled(relit, tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kernels.relight.model.beyond import LONGEST_REACH, compare_beyond, followed, inward_pairs, reach, share_beyond, spacing
+from kernels.relight.model.beyond import LONGEST_REACH, compare_beyond, followed, inward_pairs, reach, share_beyond, spacing, trusted
 from tests.kernels.relight.lights import AXES, icosahedron, scattered
 from tests.kernels.relight.surfaces import LOBE, captured, facing, scattered_pixels
 from tests.kernels.scenes import colours
@@ -49,6 +49,11 @@ def test_lights_are_predicted_from_farther_inside():
 def test_gains_are_added_and_losses_are_shares():
     change, picture, model = np.float32([[1, -1, -2, -1, -1]]), np.float32([[5, 5, 5, 5, -1]]), np.float32([[2, 2, 2, 0, 2]])
     np.testing.assert_array_equal(followed(change, picture, model), np.float32([[1, -2.5, -5, 0, 0]]))
+
+
+def test_losses_are_trusted_as_at_the_median_pixel_at_least():
+    change, trust = np.float32([[1, 1, 1], [-1, -1, -1]]), np.float32([0.2, 0.6, 1])
+    np.testing.assert_array_equal(trusted(change, trust, 0.6), np.float32([[0.2, 0.6, 1], [-0.6, -0.6, -1]]))
 
 
 def sums(pixels, readings, device, *, clipped=None):

@@ -12,7 +12,7 @@ COUNT, IMAGE, FRAMES, FIRST = 13, 40, 5, 2
 RNG = np.random.default_rng(5)
 
 
-def twin(plain, trust, trust_beyond, albedo, small, sums, has_added, has_beyond):
+def twin(plain, trust, trust_beyond, least, albedo, small, sums, has_added, has_beyond):
     """Return frames and their specular part; `sums` by name, [frames, 3, n]."""
     given = sums["gloss_given"]
     ratio = np.where(given > 1e-9, sums["shown_given"] / np.where(given > 1e-9, given, 1), 1)
@@ -26,7 +26,7 @@ def twin(plain, trust, trust_beyond, albedo, small, sums, has_added, has_beyond)
     if has_beyond:
         shine = sums["beyond_gloss"] + sums["beyond_small"][:, 3:]
         gain = albedo * sums["beyond_matt"] + sums["beyond_small"][:, :3] + shine - inside
-        change = change + trust_beyond * np.where(gain < 0, gain * share, gain)
+        change = change + np.where(gain < 0, np.maximum(trust_beyond, least) * gain * share, trust_beyond * gain)
         mirror = mirror + shine
     if has_added:
         mirror = mirror + sums["added_gloss"]
@@ -56,15 +56,17 @@ def test_frames_are_corrected_as_in_float64(has_added, has_beyond, wanted, devic
     places = np.array([6, 0, 3, 5, 1])
     frames = RNG.uniform(-0.1, 1, (7, 3, IMAGE)).astype(np.float32)
     trust, beyond = RNG.uniform(0, 1, (2, COUNT)).astype(np.float32)
+    least = float(np.median(beyond))
     packed = wp.array(values.reshape(24, -1, pack), dtype=wp.types.vector(pack, wp.float32), shape=(24, padded // pack), device=device)
     made = FramesOnDevice(there(frames), wp.zeros((7 if wanted else 0, 3, IMAGE), dtype=wp.float32, device=device))
     owned = [there(plane if name not in empty else plane[:0]) for name, plane in sums.items()]
-    pixels = Pixels(packed, wp.array(position, dtype=wp.int32, device=device), there(trust), there(beyond if has_beyond else beyond[:0]))
+    pixels = Pixels(packed, wp.array(position, dtype=wp.int32, device=device), there(trust),
+                    there(beyond if has_beyond else beyond[:0]), least)
     correct_frames(made, wp.array(places, dtype=wp.int32, device=device), FIRST, FrameSums(*owned), there(small), pixels)
 
     used = {name: plane[FIRST:, :, :COUNT].astype(np.float64) for name, plane in sums.items()}
     plain = frames[places[FIRST:]][:, :, position].astype(np.float64)
-    expected, mirror = twin(plain, trust, beyond, values[3:6, :COUNT], small[:, :, :COUNT], used, has_added, has_beyond)
+    expected, mirror = twin(plain, trust, beyond, least, values[3:6, :COUNT], small[:, :, :COUNT], used, has_added, has_beyond)
     found = made.radiance.numpy()
     np.testing.assert_allclose(found[places[FIRST:]][:, :, position], expected, atol=1e-5)
     if wanted:

@@ -25,6 +25,9 @@ def test_a_page_is_small_fits_and_has_no_violation(browser, server, solved, name
     for width in (1280, 640, 390):  # 640 px: a screen of 1280 px at 200 %
         page.set_viewport_size({"width": width, "height": 844})
         page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
+    # names were cut to five letters a line beside dates that left the screen of a telephone
+    tables = page.locator("#jobs, #captures, #environments")
+    assert tables.evaluate_all("tables => tables.every(each => each.scrollWidth <= each.clientWidth)")
     for details in page.locator("details").all():
         details.evaluate("each => { each.open = true; }")
     assert violations_in_both_schemes(page) == []

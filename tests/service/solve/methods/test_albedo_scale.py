@@ -8,6 +8,7 @@ import pytest
 from service.requests.solve import SolveRequest
 from service.solve.methods.shadow_light import fit_albedo_scale, shown_bounce
 from service.solve.solve import solve
+from stage.results.maps import ALBEDO_SCALE
 from tests.reference.groove import Groove, Trough
 from tests.reference.sampling import lattice
 from tests.scenes.captures import distant, write_lit
@@ -141,7 +142,7 @@ def test_maps_have_the_albedo_of_the_surface(by_declaration):
     """The factor is recorded, by which the maps guide the relighting of the images."""
     result, _, report = by_declaration["relative"]
     assert np.median(result.maps.diffuse_albedo) == pytest.approx(ALBEDO, rel=0.15)
-    assert result.maps.albedo_scale == report["found"]["albedo_factor"] == pytest.approx(SCALE, rel=0.12)
+    assert float(result.maps.provenance[ALBEDO_SCALE]) == report["found"]["albedo_factor"] == pytest.approx(SCALE, rel=0.12)
 
 
 def test_lights_are_absolute_unless_declared(by_declaration, tmp_path):

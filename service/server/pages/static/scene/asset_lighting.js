@@ -27,21 +27,34 @@ export function neutralRoom() {
 }
 
 /**
- * Return the exposure in stops that shows a white surface as white: one that faces a light of this irradiance, or as much light from all around.
+ * Return the exposure in stops that shows a white surface as white: one that faces light of this irradiance.
  * @param {number} irradiance The largest of its channels.
  */
 export function stopsFor(irradiance) {
   return irradiance > 0 ? Math.log2(Math.PI / irradiance) : 0;
 }
 
-/** Return π times the mean radiance of a map over the sphere, the largest of the channels. */
-export function meanIrradiance({ rows, cols, pixels }) {
-  const sums = [0, 0, 0];
+/** Return the irradiance of a map on a surface that faces its light, taken as one distant light before an even rest: the largest of the channels. */
+export function facingIrradiance({ rows, cols, pixels }) {
+  const sums = new Float64Array(12); // over the sphere, of the radiance and of its x, y and z parts: three channels each
   for (let row = 0; row < rows; row += 1) {
-    const weight = Math.sin((Math.PI * (row + 0.5)) / rows) * (Math.PI / rows / 2 / cols);
-    for (let at = 3 * row * cols; at < 3 * (row + 1) * cols; at += 1) sums[at % 3] += weight * pixels[at];
+    const polar = (Math.PI * (row + 0.5)) / rows;
+    const [sine, cosine] = [Math.sin(polar), Math.cos(polar)];
+    for (let col = 0; col < cols; col += 1) {
+      const azimuth = (2 * Math.PI * (col + 0.5)) / cols;
+      const [x, z] = [Math.sin(azimuth) * sine, -Math.cos(azimuth) * sine];
+      for (let c = 0; c < 3; c += 1) {
+        const light = pixels[3 * (row * cols + col) + c] * sine;
+        sums[c] += light;
+        sums[3 + c] += light * x;
+        sums[6 + c] += light * cosine;
+        sums[9 + c] += light * z;
+      }
+    }
   }
-  return Math.PI * Math.max(...sums);
+  // a distant light of irradiance E has the sum E and a vector of length E, an even radiance L the sum 4 π L and none: E and π L come out
+  const facing = [0, 1, 2].map((c) => sums[c] / 4 + 0.75 * Math.hypot(sums[3 + c], sums[6 + c], sums[9 + c]));
+  return (Math.max(...facing) * 2 * Math.PI ** 2) / rows / cols;
 }
 
 /**

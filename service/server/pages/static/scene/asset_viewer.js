@@ -3,7 +3,7 @@
 import { Group, LinearToneMapping, Matrix4 } from "three";
 import { element, numberOf, tell } from "../element.js";
 import { openAsset } from "./asset_file.js";
-import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
+import { facingIrradiance, Lighting, neutralRoom, stopsFor } from "./asset_lighting.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
 import { VIEW_TRANSFORM } from "../view/display.js";
 import { previewOf, readEnvironment } from "../view/light/environment_map.js";
@@ -96,7 +96,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     if (chosen === ROOM || chosen === MAP) {
       const shown = chosen === ROOM ? room : map;
       lighting.byMap(shown);
-      irradiance = meanIrradiance(shown);
+      irradiance = facingIrradiance(shown);
     } else {
       const { frame } = lights.find(({ index }) => index === Number(chosen));
       const shown = frame.irradiance === null ? [1, 1, 1] : converted(matrixBetween(rig.color_space, DISPLAY_SPACE), frame.irradiance);
