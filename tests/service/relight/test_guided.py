@@ -9,7 +9,7 @@ import pytest
 from service.relight.model_range import LitModel, correction
 from service.reporting.provenance import HASHING
 from stage.stack.ingest import LAYOUT
-from tests.kernels.scenes import cap
+from tests.reference.sampling import lattice
 from tests.scenes.captures import edit_manifest, rgb, write_exr
 from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
@@ -70,7 +70,7 @@ def test_highlights_of_the_captured_lights_are_no_light_from_behind(relit, tmp_p
     """Maps with narrower highlights than a ball has that lights in front of it lit, and a sun behind it: the plain sum has the shading and
     highlights of the nearest lights. A fifth of it was left where the readings of highlights contradict the maps; a hundredth is what the
     trust of the median pixel may lack of 1."""
-    write_dome(tmp_path / "cap", SURFACE, directions=cap(24, 40))
+    write_dome(tmp_path / "cap", SURFACE, directions=lattice(24, 40))
     write_maps(tmp_path / "maps", SURFACE, roughness=np.full(SURFACE.mask.shape, 0.3, np.float32))
     sun = {"name": "sun", "keys": [{"frame": 1, "direction": [-0.6, 0, -0.8], "irradiance": [2, 2, 2]}]}
     (tmp_path / "keys.json").write_text(json.dumps({"schema": "relit.keys/1", "lights": [sun]}))
