@@ -15,7 +15,7 @@ from service.calibrate.solvers.boards.bundle import bend_words
 from service.calibrate.solvers.charuco import charuco_of
 from service.calibrate.solvers.known_lens import BoardLens, lens_by_boards
 from service.calibrate.solvers.laser_plane import LightPlane, board_surface, fit_light_plane
-from service.calibrate.solvers.laser_step import fit_step
+from service.calibrate.solvers.laser_step import StepPlane, fit_step
 from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
 from service.calibrate.solvers.target_stripes import even_light, find_stripes, laser_frames, whole_stripes
 from service.depth.base.triangulation_check import check_perspective
@@ -136,9 +136,7 @@ def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str
                                        ) from error
             planes.append(error)
             continue
-        away = float((plane.point - beside.point) @ beside.normal)
-        turned = math.degrees(math.asin(min(float(np.linalg.norm(np.cross(plane.normal, beside.normal))), 1.0)))
-        sigma_m, sigma_degrees = math.hypot(plane.sigma_m, away), math.hypot(plane.sigma_degrees, turned)
+        sigma_m, sigma_degrees = _widened(plane, beside.point, beside.normal)
         planes.append(MeasuredPlane(
             plane.point, plane.normal, sigma_m, sigma_degrees,
             {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{sigma_degrees:.3g}"), "points": plane.points},
@@ -177,6 +175,13 @@ def _other_lens(lens: BoardLens | None, camera: Camera, where: str) -> tuple[tup
                  "the difference" for words in said), other if said else None
 
 
+def _widened(plane: LightPlane | StepPlane, point: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
+    """Return the standard errors of a plane, in metres and degrees, which hold how far the plane by another lens differs."""
+    away = float((plane.point - point) @ normal)
+    turned = math.degrees(math.asin(min(float(np.linalg.norm(np.cross(plane.normal, normal))), 1.0)))
+    return math.hypot(plane.sigma_m, away), math.hypot(plane.sigma_degrees, turned)
+
+
 def _plane_on_boards(views: dict[str, BoardView], index: int, camera: Camera, bend: np.ndarray | None, request: LaserPlanesRequest
                      ) -> LightPlane:
     """Return the plane of a laser frame by its stripes on all boards that show it, as this camera sees them."""
@@ -207,14 +212,23 @@ def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Ti
         raise CalibrationError(f"frame {laser_frames(captures[0])[worst].image}: its stripe misses base, riser and top of an upright "
                                f"block by {fit.planes[worst].residual_px:.2g} px: look for light of other surfaces, a base that is not "
                                "flat, or a block that is not right-angled")
-    planes = [MeasuredPlane(plane.point, plane.normal, plane.sigma_m, plane.sigma_degrees,
-                            {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"),
+    said: tuple[str, ...] = ()
+    sigmas = [(plane.sigma_m, plane.sigma_degrees) for plane in fit.planes]
+    if fit.focal is not None and abs(fit.focal[0] - 1) > max(LENS_SIGMAS * fit.focal[1], LEAST_FOCAL):
+        said = (f"{captures[0].folder / FILE_NAME}: camera: the stripes of all poses fit best with {fit.focal[0]:.3f} times focal_px "
+                f"(σ {fit.focal[1]:.1g}), as where the camera was refocused, its distortion is missing, or the block leans: measure the "
+                "camera again, and the block; the standard errors of the planes hold the difference",)
+        sigmas = [_widened(plane, *other) for plane, other in zip(fit.planes, fit.beside, strict=True)]
+    planes = [MeasuredPlane(plane.point, plane.normal, sigma_m, sigma_degrees,
+                            {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{sigma_degrees:.3g}"),
                              "sigma_depth": float(f"{plane.sigma:.3g}"), "poses": plane.stripes},
-                            (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth")) for plane in fit.planes]
+                            (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth"))
+              for plane, (sigma_m, sigma_degrees) in zip(fit.planes, sigmas, strict=True)]
     return _OnTarget(planes, {"steps": [
         {"capture": str(capture.folder), "stripes": sum(stripe is not None for stripe in found),
          "with_riser": sum(stripe is not None and stripe.riser is not None for stripe in found), "distance_m": float(f"{distance:.5g}")}
-        for capture, found, distance in zip(captures, stripes, fit.distances_m, strict=True)]})
+        for capture, found, distance in zip(captures, stripes, fit.distances_m, strict=True)],
+        "focal_by_steps": None if fit.focal is None else digits(fit.focal)}, said)
 
 
 def _stripes_on_step(capture: Capture, device: str, pixel: float) -> list[StepStripe | None]:
