@@ -1,4 +1,4 @@
-"""Laser planes from their stripes on a chessboard: the board's plane by its corners, and a plane through the stripes of several poses.
+"""Laser planes from their stripes on a chessboard: the board's surface by its corners, and a plane through the stripes of several poses.
 
 Sources: the pose of a plane from points, Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, refined by
 Levenberg and Marquardt's method in OpenCV; the plane of light from its stripes on boards of known pose, Zhou and Zhang, "Complete
@@ -13,6 +13,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from service.calibrate.solvers.boards.bundle import BEND, UP, second_order
+from service.calibrate.solvers.procam import board_points
 from stage.capture.camera import Camera
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
@@ -28,42 +30,30 @@ APART = 5.0
 which the others miss theirs by so many times less."""
 LEAST_OTHERS = 3
 """The fewest boards that agree on a plane, and on that another is to blame: through two stripes that are nearly parallel a plane goes."""
-UNIT_PX = 1000.0
-"""Focal length of the camera without distortion in whose image corners are compared; any will do."""
-
-LEAST_BOARDS = 3
-"""Boards from which a focal length follows."""
+MEETINGS = 4
+"""Steps in which lines of sight find a bent board; each leaves of what is open its slope times the tangent of the line."""
 
 
-class BoardPlane(NamedTuple):
-    """The plane of a chessboard in the camera frame."""
+class BoardSurface(NamedTuple):
+    """The surface of a chessboard in the camera frame, on OpenCV's axes."""
 
-    point: np.ndarray  # [3] metres, a corner
-    normal: np.ndarray  # [3] unit, towards the camera
+    turn: np.ndarray  # [3, 3] from the frame of the board
+    shift: np.ndarray  # [3] metres
+    bend: np.ndarray  # [BEND] metres, as of `BoardLens`
+    last: np.ndarray  # [2] metres, the last corner of the board in its frame; the first one is 0
     rms_px: float
     """Root mean square distance of the corners from where the pose puts them."""
 
     def meet(self, camera: Camera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return where the lines of sight of image coordinates meet the plane, [n, 3] metres."""
+        """Return where the lines of sight of image coordinates meet the board, [n, 3] metres in the camera frame."""
         x, y = camera.plane_at(u, v)
-        rays = np.stack([x, y, -np.ones_like(x)], axis=1)
-        return np.asarray(rays * (self.point @ self.normal / (rays @ self.normal))[:, None])
-
-
-class BoardLens(NamedTuple):
-    """The lens by which boards fit best."""
-
-    focal: float
-    """Focal length over that of the camera."""
-    focal_sigma: float
-    bent_focal: float
-    """The same where k1 is free too."""
-    bent_focal_sigma: float
-    k1: float
-    """Radial distortion beside that of the camera."""
-    k1_sigma: float
-    k1_px: float
-    """What k1 moves the outermost corner by, pixels."""
+        rays = np.stack([x, -y, np.ones_like(x)], axis=1) @ self.turn  # in the frame of the board
+        origin = -self.shift @ self.turn
+        height = np.zeros_like(x)
+        for _ in range(MEETINGS):
+            points = origin + rays * ((height - origin[2]) / rays[:, 2])[:, None]
+            height = second_order(points[:, :2], np.zeros(2), self.last) @ self.bend
+        return np.asarray((points @ self.turn.T + self.shift) @ OPENCV_FROM_CAMERA)
 
 
 class LightPlane(NamedTuple):
@@ -80,57 +70,28 @@ class LightPlane(NamedTuple):
     points: int
 
 
-def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
-    """Return the plane of a chessboard.
+def board_surface(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera, bend: np.ndarray | None = None
+                  ) -> BoardSurface:
+    """Return the surface of a chessboard.
     `corners`: [across × down, 2] image coordinates, row by row, NaN where one is not seen. `board`: its inner corners across and down.
-    `camera`: a calibrated perspective one."""
-    across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
-    seen_corners = np.isfinite(corners).all(axis=-1)
-    corners = corners[seen_corners]
-    points = (np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m)[seen_corners]
+    `camera`: a calibrated perspective one. `bend`: as of `BoardLens`; None: it is flat."""
+    every = board_points(board, square_m).astype(float)
+    bend, last = np.zeros(BEND) if bend is None else bend, every[-1, :2]
+    known = np.isfinite(corners).all(axis=-1)
+    corners, points = corners[known], every[known]
     x, y = camera.plane_at(corners[:, 0], corners[:, 1])
     seen = np.stack([x, -y], axis=1)  # lens distortion is undone, OpenCV's y is down
-    found, turn, shift = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
+    found, rotation, shift = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
     if not found:
         raise CalibrationError("the corners of the board have no pose")
-    rotation = cv2.Rodrigues(turn)[0]
-    own = points @ rotation.T + shift.ravel()
+    if bend.any():
+        points = points + np.outer(second_order(points[:, :2], np.zeros(2), last) @ bend, UP)
+        rotation, shift = cv2.solvePnPRefineLM(points, seen, np.eye(3), None, rotation, shift)
+    turn = cv2.Rodrigues(rotation)[0]
+    own = points @ turn.T + shift.ravel()
     assert camera.focal_px is not None
     off = (own[:, :2] / own[:, 2:] - seen) * camera.focal_px
-    to_camera = OPENCV_FROM_CAMERA.T
-    point, normal = to_camera @ shift.ravel(), to_camera @ rotation[:, 2]
-    return BoardPlane(point, normal if normal @ point < 0 else -normal, float(np.sqrt((off**2).sum(axis=1).mean())))
-
-
-def lens_by_boards(corners: list[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> BoardLens | None:
-    """Return the lens of a camera by which boards fit best; what is not measured stays. None from fewer than three boards, or where they do
-    not tell. `corners`, `board`: as of `board_plane`, of each board."""
-    if len(corners) < LEAST_BOARDS:
-        return None
-    across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
-    every = (np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m).astype(np.float32)
-    points, seen = [], []
-    for own in corners:
-        known = np.isfinite(own).all(axis=-1)
-        x, y = camera.plane_at(*own[known].T)
-        points.append(every[known])
-        seen.append((UNIT_PX * np.stack([x, -y], axis=1)).astype(np.float32))
-    fixed = (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
-             | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO)
-    told: list[float] = []
-    try:
-        for flags in (fixed | cv2.CALIB_FIX_K1, fixed):
-            _, matrix, bent, _, _, spread, _, _ = cv2.calibrateCameraExtended(
-                points, seen, (round(2 * UNIT_PX), round(2 * UNIT_PX)), np.diag([UNIT_PX, UNIT_PX, 1.0]), np.zeros(5), flags=flags)
-            told += [float(matrix[0, 0]) / UNIT_PX, float(spread[:2].max()) / UNIT_PX, float(bent.ravel()[0]), float(spread.ravel()[4])]
-    except cv2.error:
-        return None
-    focal, focal_sigma, _, _, bent_focal, bent_focal_sigma, k1, k1_sigma = told
-    if not np.isfinite(told).all() or min(focal, bent_focal) <= 0:
-        return None
-    farthest = max(float(np.hypot(*own.T).max()) for own in seen) / UNIT_PX
-    assert camera.focal_px is not None
-    return BoardLens(focal, focal_sigma, bent_focal, bent_focal_sigma, k1, k1_sigma, abs(k1) * farthest**3 * max(camera.focal_px))
+    return BoardSurface(turn, shift.ravel(), bend, last, float(np.sqrt((off**2).sum(axis=1).mean())))
 
 
 def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
@@ -197,9 +158,14 @@ def _to_blame(poses: Sequence[np.ndarray], names: Sequence[str]) -> str:
 
 
 def _scatter(points: np.ndarray) -> float:
-    """Return the robust standard deviation of points about their line, metres."""
-    along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
+    """Return the robust standard deviation of points about their line, metres, or about the parabola that it is on a board that is bent."""
     off = points - np.median(points, axis=0)
-    across = off - np.outer(off @ along, along)
-    widest = np.linalg.svd(across, full_matrices=False)[2][0]
+    along = off @ np.linalg.svd(off, full_matrices=False)[2][0]
+    way = np.vander(along / max(float(np.abs(along).max()), 1e-12), 3)
+    weight = np.ones((len(points), 1))
+    for _ in range(ROUNDS):
+        across = off - way @ np.linalg.lstsq(weight * way, weight * off)[0]
+        far = np.linalg.norm(across, axis=1, keepdims=True)
+        weight = 1 / np.hypot(1, far / (CAUCHY * MAD_TO_SIGMA * np.median(far) + 1e-9))
+    widest = np.linalg.svd(weight * across, full_matrices=False)[2][0]
     return MAD_TO_SIGMA * float(np.median(np.abs(across @ widest)))

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
-from service.calibrate.solvers.step_stripe import Segment, StepStripe
+from service.calibrate.solvers.step_stripe import Segment, StepStripe, best_line
 from stage.errors import CalibrationError
 
 NUMBERS = 6
@@ -28,6 +28,11 @@ SETTLED = 1e-12
 """Parts of the sum of squares, of the parameters and of the gradient by which the last step changes them."""
 LARGEST_SIGMA, LARGEST_SIGMA_DEGREES = 0.02, 1.0
 """The largest standard errors of a plane that is written: of depths on it as a part of them, and of its tilt."""
+
+LEAST_POSES = 2
+"""Poses of the step from which a focal length follows."""
+FACE_PX = 4.0
+"""Pixels by which the foot or the edge of a stripe's riser may lie beside the line of the others on one upright face."""
 
 
 class StepPlane(NamedTuple):
@@ -53,6 +58,10 @@ class StepFit(NamedTuple):
     planes: list[StepPlane]
     distances_m: list[float]
     """Distance of the base from the camera's centre in each pose."""
+    focal: tuple[float, float] | None
+    """Focal length by which the stripes fit best over that of the camera, and its standard error; None from one pose, which tells none."""
+    beside: list[tuple[np.ndarray, np.ndarray]]
+    """Point and normal of each plane by that focal length."""
 
 
 def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixel: float) -> StepFit:
@@ -65,11 +74,12 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
         if not any(pose[number] is not None for pose in poses):
             raise CalibrationError(f"frame {number + 1} of the laser: its stripe is not seen to cross base, block and base: put the block "
                                    "into the middle of the stripe")
+    poses = [_one_face(pose, FACE_PX * pixel) for pose in poses]
     steps, planes = zip(*(_begin(number, pose, height_m) for number, pose in enumerate(poses)), strict=True)
     middle = np.array([np.mean([shown[number] for shown in planes if number in shown], axis=0) for number in range(count)])
     values = np.concatenate([np.concatenate(steps), middle.ravel()])
     data = _Data.of(poses, height_m)
-    found = least_squares(data.residual, values, jac="3-point", method="lm", x_scale="jac", ftol=SETTLED, xtol=SETTLED, gtol=SETTLED)
+    found = _solved(data, np.append(values, 1.0), free=False)
     values, residual, jacobian = found.x, found.fun, found.jac
     freedom = len(residual) - len(values)
     if freedom < 1:
@@ -86,7 +96,29 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
         told = "hardly" if lost or worst.sigma > 1 else f"to {100 * worst.sigma:.1f} % of the depth and {worst.sigma_degrees:.1f}° alone"
         raise CalibrationError(f"the step tells the planes {told}: look at it from 30 to 60 degrees above its base, let it fill more of "
                                "the image, take a higher one, or photograph it in several poses")
-    return StepFit(lasers, [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))])
+    distances = [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))]
+    if len(poses) < LEAST_POSES:
+        return StepFit(lasers, distances, None, [])
+    again = _solved(data, np.append(values, 1.0), free=True)
+    noise = max(float(again.fun @ again.fun) / max(len(again.fun) - len(again.x), 1), 1.0)
+    scale = np.maximum(np.linalg.norm(again.jac, axis=0), 1e-300)
+    sigma = math.sqrt(noise * float(np.linalg.pinv((again.jac / scale).T @ (again.jac / scale), hermitian=True)[-1, -1])) / scale[-1]
+    beside = []
+    for plane in again.x[NUMBERS * data.poses:-1].reshape(-1, 3):
+        length = float(np.linalg.norm(plane))
+        beside.append((plane / length**2, plane / length))
+    return StepFit(lasers, distances, (float(again.x[-1]), float(sigma)), beside)
+
+
+def _solved(data: "_Data", start: np.ndarray, *, free: bool) -> OptimizeResult:
+    """Return the least-squares fit of poses and planes from `start`, whose last number is the focal length over that of the camera.
+    `free`: whether that is fitted too; otherwise the fit has all numbers but it."""
+    def residual(values: np.ndarray) -> np.ndarray:
+        focal = values[-1] if free else start[-1]
+        return data.residual(values[:len(start) - 1], focal)
+
+    return least_squares(residual, start if free else start[:-1], jac="3-point", method="lm", x_scale="jac", ftol=SETTLED, xtol=SETTLED,
+                         gtol=SETTLED)
 
 
 class _Data(NamedTuple):
@@ -110,8 +142,9 @@ class _Data(NamedTuple):
         weight = np.array([row[3].weight**0.5 / row[3].noise for row in rows])
         return cls(face, pose, laser, ends, weight, len(poses), height_m)
 
-    def residual(self, values: np.ndarray) -> np.ndarray:
-        """Return the distances of the ends of each line from its place, and the leans, in standard deviations, [2 lines + poses]."""
+    def residual(self, values: np.ndarray, focal: float = 1.0) -> np.ndarray:
+        """Return the distances of the ends of each line from its place, and the leans, in standard deviations, [2 lines + poses].
+        `focal`: focal length over that by which the coordinates are normalised."""
         steps = values[:NUMBERS * self.poses].reshape(-1, NUMBERS)[self.pose]
         laser = values[NUMBERS * self.poses:].reshape(-1, 3)[self.laser]
         base = steps[:, :3]
@@ -123,7 +156,7 @@ class _Data(NamedTuple):
         offset = np.where(face == 0, 1.0, np.where(face == 1, 1 - self.height_m * length, steps[:, 4:5]))
         line = normal - offset * laser
         line = line / np.maximum(np.linalg.norm(line[:, :2], axis=1, keepdims=True), 1e-12)
-        off = np.einsum("lec,lc->le", self.ends, line) * self.weight[:, None]
+        off = np.einsum("lec,lc->le", self.ends / np.array([focal, focal, 1.0]), line) * self.weight[:, None]
         return np.concatenate([off.ravel(), values[:NUMBERS * self.poses].reshape(-1, NUMBERS)[:, 5] / LEAN])
 
 
@@ -134,6 +167,19 @@ def _in_plane(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     aside = np.where(flat, np.cross(normal, np.array([1.0, 0.0, 0.0])), aside)
     aside = aside / np.linalg.norm(aside, axis=1, keepdims=True)
     return aside, np.cross(normal, aside)
+
+
+def _one_face(stripes: Sequence[StepStripe | None], tolerance: float) -> list[StepStripe | None]:
+    """Return the stripes of a pose without risers on another upright face than most: stripes near a corner of the block cross that."""
+    found, rising = list(stripes), [stripe for stripe in stripes if stripe is not None and stripe.riser is not None]
+    if len(rising) < 3:
+        return found
+    kept = np.ones(len(rising), bool)
+    for meets in ([_meet(stripe.base, stripe.riser) for stripe in rising if stripe.riser is not None],
+                  [_meet(stripe.top, stripe.riser) for stripe in rising if stripe.riser is not None]):
+        kept &= best_line(np.array(meets)[:, :2], tolerance, np.random.default_rng(0))[1]
+    others = [stripe for stripe, own in zip(rising, kept, strict=True) if not own and kept.sum() > 1]
+    return [stripe._replace(riser=None) if stripe is not None and any(stripe is other for other in others) else stripe for stripe in found]
 
 
 def _begin(number: int, stripes: Sequence[StepStripe | None], height_m: float) -> tuple[np.ndarray, dict[int, np.ndarray]]:

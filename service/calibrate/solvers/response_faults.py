@@ -3,7 +3,8 @@
 Each pixel reads ambient + s · g(level). Where the readings of groups of pixels are no such lines of the response, the readings are not
 linear in light, or the exposure was not the same in all images; pixels that the projector does not reach, and that get darker with the
 level, tell of the latter. A level whose light is not between what its neighbours suggest is an image of another level; where all levels
-are a little off, the lamp or the exposure flickers. Light that no longer rises at the last levels is cut off.
+are a little off, the lamp or the exposure flickers. Light that no longer rises at the last levels is cut off. A power that no projector has
+is that of another encoding of the images.
 """
 
 import numpy as np
@@ -11,9 +12,12 @@ import numpy as np
 from stage.spread import MAD_TO_SIGMA
 
 GROUPS = 24
-"""Groups of pixels of equal brightness, whose means have little noise."""
-BENT, BENT_SIGMAS = 0.002, 4.0
-"""Root mean square misfit of the lines, as a part of full scale and in standard errors, above which they are bent."""
+"""Groups of pixels of equal brightness, and of equal parts of ambient light, whose means have little noise."""
+HALF = 8
+"""Pixels that choose the group of as many beside them: a group that its own readings choose is one of equal noise."""
+BENT, BENT_SIGMAS = 0.0015, 2.0
+"""Root mean square misfit of the lines, as a part of full scale and in standard errors, above which they are bent; right
+images make .0013, or 1.7 of them."""
 FALLING = -0.01
 """Change of a group from the darkest to the brightest level, as a part of full scale, below which it gets darker."""
 ALONE = 0.05
@@ -23,20 +27,31 @@ FLICKER, FLICKER_LEVELS = 0.01, 12
 levels between the ends that tell of it: with so many the kinks of video make 0.4 %."""
 DARK = 0.01
 """Readings below this part of the brightest tell of no flicker."""
-FLAT_LIGHT, FLAT_LEVELS = 0.998, 0.1
-"""Light from which on it does not rise, as a part of full scale, and the least part of the levels that have it; 0.06 are white in video."""
+FLAT_LIGHT, FLAT_LEVELS, DARK_LEVELS = 0.998, 0.1, 0.2
+"""Light from which on it does not rise, as a part of full scale, and the least part of the levels that have it; 0.06 are white in video.
+The same of black, above which the light of the steepest power has risen (level^3.3)."""
+GAMMAS = 0.7, 3.3
+"""Exponents of projectors: those of their picture modes are 1 to 2.8."""
+BETWEEN = 0.02
+"""Light, as a part of full scale, to which it is known between the levels, above which more of them are asked for."""
 MOST_SPREAD = 0.05
 """Median deviation of the pixels from the response above which it is not sure."""
 
 
-def response_faults(levels: np.ndarray, readings: np.ndarray, curve: np.ndarray, full_scale: float, spread: float) -> tuple[str, ...]:
+def response_faults(levels: np.ndarray, readings: np.ndarray, curve: np.ndarray, *, full_scale: float, spread: float, gamma: float,
+                    between: float) -> tuple[str, ...]:
     """Return sentences about what is wrong with the images of a response.
-    `levels`: [levels] rising from 0 to 1. `readings`: [levels, pixels] linear. `curve`: [levels] the light, from 0 to 1. `full_scale`: by
-    how much the readings rise. `spread`: median deviation of a pixel from the curve, as a part of full scale."""
+    `levels`: [levels] rising from 0 to 1. `readings`: [levels, pixels] linear, beside each other in the image. `curve`: [levels] the light,
+    from 0 to 1. `full_scale`: by how much the readings rise. `spread`: median deviation of a pixel from the curve, as a part of full scale.
+    `gamma`: exponent of the nearest power. `between`: light to which the curve is known between its levels."""
     design = np.column_stack([np.ones(len(levels)), curve])
     basis = np.linalg.qr(design).Q
-    order = np.argsort(readings[1:-1].mean(axis=0))
-    groups = [readings[:, group] for group in np.array_split(order, min(GROUPS, len(order)))]
+    half = max(1, min(HALF, readings.shape[1] // (2 * GROUPS)))
+    runs = readings[:, :readings.shape[1] // (2 * half) * 2 * half].reshape(len(levels), -1, 2, half).mean(axis=-1)
+    ambient, scale = np.linalg.lstsq(design, runs[..., 0])[0]
+    bright = ambient + scale
+    groups = [runs[:, group, 1] for key in (bright, ambient / np.maximum(bright, DARK * bright.max()))
+              for group in np.array_split(np.argsort(key), min(GROUPS, len(key)))]
     means = np.stack([group.mean(axis=1) for group in groups], axis=1)
     left = means - basis @ (basis.T @ means)
     errors = np.stack([(group - basis @ (basis.T @ group)).std(axis=1) / np.sqrt(group.shape[1]) for group in groups], axis=1)
@@ -58,10 +73,19 @@ def response_faults(levels: np.ndarray, readings: np.ndarray, curve: np.ndarray,
     if flicker > FLICKER:
         faults.append(f"images are brighter and darker by {100 * flicker:.2g} % from level to level: the lamp or the exposure flickers, "
                       "and the response is as much off: fix the exposure, and take the mean of several images of each level")
+    black = levels[np.flatnonzero(curve < 1 - FLAT_LIGHT)[-1]]
+    if black > DARK_LEVELS:
+        faults.append(f"the light does not rise up to level {black:.3g}: check that its image shows this level, and that of black the same "
+                      "exposure")
+    elif not GAMMAS[0] < gamma < GAMMAS[1]:
+        faults.append(f"the response is nearest to level^{gamma:.2g}, and those of projectors to powers of {GAMMAS[0]:g} to {GAMMAS[1]:g}: "
+                      "check color_space, --levels, and the exposures")
     flat = levels[np.flatnonzero(curve < FLAT_LIGHT)[-1] + 1]
     if 1 - flat > FLAT_LEVELS:
         faults.append(f"the light does not rise above level {flat:.3g}: readings saturate there, or the projector shows no more: shorten "
                       "the exposure, or give the saturation of the camera")
+    if between > BETWEEN and not faults:
+        faults.append(f"between its levels the light is known to {between:.2g} of full scale alone: give images of more levels")
     if spread > MOST_SPREAD:
         faults.append(f"pixels deviate by {spread:.2g} of full scale from the response: give brighter images, without anything that moves")
     return tuple(faults)

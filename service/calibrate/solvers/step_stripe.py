@@ -67,7 +67,7 @@ def split_stripe(
     for _ in range(3):  # base, top and riser, in the order of their points
         if len(left) < LEAST_TOP:
             break
-        line, own = _best_line(points[left], tolerance, random)
+        line, own = best_line(points[left], tolerance, random)
         if own.sum() < LEAST_TOP:
             break
         lines.append(line)
@@ -99,8 +99,9 @@ def _count(points: np.ndarray | None) -> int:
     return 0 if points is None else len(points)
 
 
-def _best_line(points: np.ndarray, tolerance: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return the line with most points near it, and which these are."""
+def best_line(points: np.ndarray, tolerance: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the line through most of the points [n, 2] to within a tolerance, (a, b, c) as of `Segment`, and which points these are, [n]
+    bool."""
     first, second = (random.integers(0, len(points), TRIALS) for _ in range(2))
     way = points[second] - points[first]
     length = np.linalg.norm(way, axis=1)

@@ -107,3 +107,54 @@ def test_readings_at_full_scale_of_an_image_take_no_part(relit, tmp_path):
 def test_what_cannot_be_a_response_is_named(levels, curve, words):
     with pytest.raises(CalibrationError, match=words):
         fit_response(levels, grey_images(levels, curve))
+
+
+def test_few_levels_of_a_wall_accuse_nothing():
+    """Groups of pixels were chosen by the noise that they were judged by: three or four levels of a wall were called bent."""
+    random = np.random.default_rng(6)
+    for count in (3, 4, 5, 9):
+        levels = np.linspace(0, 1, count)
+        clean = 0.05 + random.uniform(0.3, 0.6, 15_000).round(1) * (levels**2.2)[:, None]
+        assert fit_response(levels, (clean + random.normal(0, 0.01, clean.shape)).astype(np.float32)).faults == ()
+
+
+@pytest.mark.parametrize(("count", "curve", "words"), [
+    (9, video, "between its levels the light is known to"),
+    (9, lambda levels: levels**4, "the response is nearest to level^4"),
+    (9, lambda levels: np.maximum(levels - 0.3, 0) ** 2, "the light does not rise up to level 0.25"),
+    (3, lambda levels: np.where(levels < 1, 0.0, 1.0), "the light does not rise up to level 0.5"),
+], ids=["few levels", "encoded", "dark levels", "a level shown twice"])
+def test_what_levels_leave_open_is_said(count, curve, words):
+    """A response that bends between its levels was 0.08 of full scale off, linear images declared encoded ones 0.24, without a word."""
+    levels = np.linspace(0, 1, count)
+    found = fit_response(levels, grey_images(levels, curve, noise=0.001))
+    assert [words in fault for fault in found.faults] == [True], found.faults
+    assert (found.between is None) == (count == 3)
+
+
+@pytest.mark.parametrize("curve", [lambda x: x * x * (3 - 2 * x), lambda x: 0.5 * x**2.2 + 0.5 * (3 * x**2 - 2 * x**3)], ids=["S", "panel"])
+def test_smooth_curves_are_followed_between_few_levels(curve):
+    """Interpolated along straight lines they were 0.010 and 0.004 off; what the levels themselves tell is never less than the error."""
+    levels = np.linspace(0, 1, 9)
+    found = fit_response(levels, grey_images(levels, curve))
+    error = np.abs(found.values - curve(np.linspace(0, 1, 256))).max()
+    assert error < 0.004 and error < found.between < 0.02
+
+
+def test_images_in_the_wrong_order_and_clipped_ones_are_refused_apart():
+    levels = np.linspace(0, 1, 5)
+    seen = grey_images(levels, lambda x: x**2.2, noise=0.001)
+    with pytest.raises(CalibrationError, match="only 0 pixels get brighter"):
+        fit_response(levels, seen[::-1])
+    with pytest.raises(CalibrationError, match="3 saturate in no image: shorten the exposure"):
+        fit_response(levels, seen, usable=np.arange(500) < 3)
+
+
+def test_images_of_another_exposure_are_refused(relit, tmp_path):
+    """A level that was exposed for twice as long made a response that was 0.28 of full scale off, and on an even wall nothing told it."""
+    folder = write_capture(tmp_path / "cap", make_scene(COLS, 3))
+    edit_manifest(folder, mask=None, color_space="lin_rec709_scene", projector={"resolution": [64, 48]})
+    for number, time in enumerate((0.01, 0.02, 0.01)):
+        write_image(folder / f"grey{number}.tif", np.full((COLS, COLS, 3), 50 * number + 10, np.uint8), ExposureTime=time)
+    words = relit.refused("calibrate", "response", folder, *(folder / f"grey{number}.tif" for number in range(3)))
+    assert "EXIF has 0.01 as the exposure time" in words and "0.02 in grey1.tif" in words

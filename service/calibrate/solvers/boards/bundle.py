@@ -41,6 +41,12 @@ UP = np.array([0.0, 0.0, 1.0])
 """The normal of a board."""
 
 
+def bend_words(height_m: float, length_m: float) -> list[str]:
+    """Return what there is to say of a board whose highest corner is so high above its lowest."""
+    said = f"the board is bent by {1000 * height_m:.2g} mm over {1000 * length_m:.0f} mm, which is fitted: a flat one is surer"
+    return [said] if height_m > TOLD_BEND * length_m else []
+
+
 class Certainty(NamedTuple):
     """Standard deviations of two devices, and of the depths that are triangulated with both."""
 
@@ -67,9 +73,7 @@ class Certainty(NamedTuple):
 
     def warnings(self) -> list[str]:
         """Return what there is to say of depths that are not sure, and of a board that is not flat."""
-        height, length = self.bend
-        bent = [f"the board is bent by {1000 * height:.2g} mm over {1000 * length:.0f} mm, which is fitted: a flat one is surer"]
-        return [*self._doubts(), *(bent if height > TOLD_BEND * length else [])]
+        return [*self._doubts(), *bend_words(*self.bend)]
 
     def _doubts(self) -> list[str]:
         if self.contradiction is not None:
@@ -255,10 +259,14 @@ def _place(first: Alone, other: Alone) -> np.ndarray:
 def _bends(sights: Sequence[Sight]) -> list[np.ndarray]:
     """Return, for each sight, by how much its corners are higher on a board of a bend of 1, [corners, BEND]."""
     corners = np.concatenate([sight.board[:, :2] for sight in sights])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    x, y = ((2 * corners - low - high) / (high - low)).T
-    heights = np.stack([x**2, x * y, y**2], axis=-1)
+    heights = second_order(corners, corners.min(axis=0), corners.max(axis=0))
     return np.split(heights, np.cumsum([len(sight.board) for sight in sights])[:-1])
+
+
+def second_order(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return x², xy and y² of places on a board [points, 2], [points, BEND], x and y from -1 to 1 between its outermost corners."""
+    x, y = ((2 * points - low - high) / (high - low)).T
+    return np.stack([x**2, x * y, y**2], axis=-1)
 
 
 def _covered(sights: Sequence[Sight], size: tuple[int, int]) -> float:
