@@ -21,7 +21,8 @@ from kernels.status import Status
 from service.reporting.progress import Timings
 from service.solve.base.solution import SolveInput
 from service.solve.methods.kinds import LOBE_PIXELS
-from service.solve.methods.material import MaterialOptions, solve_material
+from service.solve.methods.material import solve_material
+from service.solve.methods.material_options import MaterialOptions
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
 from stage.colour.colour import GREY_WEIGHTS

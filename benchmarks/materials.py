@@ -11,7 +11,8 @@ from benchmarks.fresnel import LARGEST_SHARE
 from kernels.photometric.lambertian.readings import pad_lights
 from service.reporting.progress import Timings
 from service.solve.base.solution import SolveInput
-from service.solve.methods.material import MaterialOptions, solve_material
+from service.solve.methods.material import solve_material
+from service.solve.methods.material_options import MaterialOptions
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
 from stage.formats import exr

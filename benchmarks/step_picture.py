@@ -18,7 +18,8 @@ from kernels.photometric.lambertian.readings import pad_lights
 from service.relight.sheet import write_sheet
 from service.reporting.progress import Timings
 from service.solve.base.solution import SolveInput
-from service.solve.methods.material import WHOLE_SOLVER, solve_material
+from service.solve.methods.material import solve_material
+from service.solve.methods.material_options import WHOLE_SOLVER
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
 from stage.importers import diligent

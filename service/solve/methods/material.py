@@ -5,7 +5,6 @@ from the height of its normals, the materials that pixels share, and the final s
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -43,6 +42,7 @@ from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
+from service.solve.methods.material_options import WHOLE_SOLVER, MaterialOptions
 from service.solve.methods.settling import settle
 from service.solve.methods.support import FEW_LIGHTS, simpler_normals, support_of
 from service.solve.methods.unseen_metals import replace_unseen_metals
@@ -56,33 +56,6 @@ INTENSITY_SQUARES = 8
 CLEAR = 0.3
 """Part of the solved pixels, those at which the least bounced light arrives, that tell the shape of the lobes once that light is known.
 Normals of 21 path-traced folds are 2.14° off in the mean so, 2.20° with half of the pixels, 2.38° with the shape of the whole readings."""
-
-
-@dataclass(frozen=True)
-class MaterialOptions:
-    """Steps of the svbrdf solver that can be left out, to measure what each contributes."""
-
-    shadows: bool = True
-    """Leave out readings in cast shadow."""
-    interreflection: bool = True
-    """Subtract the light that the object throws on itself."""
-    settling: bool = True
-    """Find that light again from the surface without it, or leave it where shadows show none."""
-    scale: bool = True
-    """Choose the scale of albedo from the images where that of the lights is unknown."""
-    intensities: bool = True
-    """Refine the intensities of the lights where the object shows that they are wrong."""
-    sharing: bool = True
-    """Let pixels share materials."""
-    mixtures: bool = True
-    """Let a pixel have two of the shared materials."""
-    parts: bool = True
-    """Move parts of the object in depth to where their shadows agree with the images."""
-    metals: bool = True
-    """Search the normals of metals again under the lobes that they share."""
-
-
-WHOLE_SOLVER = MaterialOptions()
 
 
 def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
