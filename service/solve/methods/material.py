@@ -184,6 +184,7 @@ class _Walk:
         settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
         self._unknown_bounce = settled.degrees
         self.result.facts |= settled.report(relative=relative)
+        self.result.warnings += settled.warnings()
         return settled.light
 
     def _clear(self, arriving: ArrivingLight) -> np.ndarray:

@@ -22,6 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
+from service.solve.base.solution import AMBIGUOUS_DEGREES
 from service.solve.height.beyond import light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.interreflection import arriving_light
@@ -80,6 +81,8 @@ class Settled(NamedTuple):
     """The fit by shadows of the scale of albedo, or of the light that arrives; None where they do not decide it."""
     degrees: np.ndarray | float = 0.0
     """By how much its unknown strength, and what may arrive from beyond the image, turn the normals, [pixels] float32."""
+    beyond: float | None = None
+    """The 95th percentile of the latter alone, degrees; None where the surface reaches no border of the image."""
 
     def report(self, *, relative: bool) -> dict[str, Any]:
         """Return what the report says about bounced light, and, where the lights are `relative`, about the scale of albedo."""
@@ -88,7 +91,16 @@ class Settled(NamedTuple):
             told["shown"] = round(self.shown, 3)
         if self.rounds:
             told["strength"] = round(self.light.albedo_scale, 3)
+        if self.beyond is not None:
+            told["beyond_image_degrees"] = round(self.beyond, 2)
         return {"bounced_light": told} | ({"albedo_scale": self._albedo_scale()} if self.rounds and relative else {})
+
+    def warnings(self) -> list[str]:
+        """Return what there is to say of light from beyond the image."""
+        if self.beyond is None or self.beyond <= AMBIGUOUS_DEGREES:
+            return []
+        return [f"the surface goes on beyond the image, and light that bounces there may turn normals by {self.beyond:.0f}°, which sigma "
+                "holds: take more of it into the picture"]
 
     def _albedo_scale(self) -> dict[str, Any]:
         if self.scale is None:
@@ -211,7 +223,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     by = [part * np.median(degrees_between(now.T, other.T)[nearest], axis=1) for (part, _), other in zip(doubted, others, strict=True)]
     degrees = np.zeros(solved.size, np.float32)
     degrees[pixels] = np.linalg.norm(by, axis=0)[block]
-    return Settled(settled, None, True, fit, degrees)
+    return Settled(settled, None, True, fit, degrees, None if beyond is None else float(np.percentile(by[1], 95)))
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """Light from beyond the image, of a valley of which the image shows one side alone."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -65,6 +66,9 @@ def test_sigma_holds_light_from_beyond_the_image(tmp_path):
     truth = valley.normals.reshape(side, side, 3)[:, :side // 2]
     error = np.degrees(np.arccos(np.clip((maps.normal * truth).sum(axis=-1), -1, 1)))
     assert np.percentile(error / maps.sigma, 95) < 2 * 3**0.5
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["found"]["bounced_light"]["beyond_image_degrees"] > np.median(error) / 3**0.5
+    assert any("goes on beyond the image" in sentence for sentence in report["warnings"])
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
