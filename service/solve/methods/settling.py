@@ -22,7 +22,6 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
-from service.solve.base.solution import AMBIGUOUS_DEGREES
 from service.solve.height.beyond import light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.interreflection import arriving_light
@@ -64,6 +63,8 @@ UNKNOWN_STRENGTH = 0.5
 1.0 to 1.2 times in matt ones."""
 BEYOND = 3**-0.5
 """Standard deviation of the light from beyond the image, as a part of that from the mirror image: anything up to that is as likely."""
+TOLD_DEGREES = 3.0
+"""Turn by light from beyond the image from which on it is said: it is 1.7 to 8.5° in folds that fill the image."""
 NEIGHBOURS = 5
 """Blocks, of which the median tells by how much an unknown strength turns normals: one pixel alone may jump to another normal."""
 SHADOW_PART = 0.1
@@ -97,7 +98,7 @@ class Settled(NamedTuple):
 
     def warnings(self) -> list[str]:
         """Return what there is to say of light from beyond the image."""
-        if self.beyond is None or self.beyond <= AMBIGUOUS_DEGREES:
+        if self.beyond is None or self.beyond <= TOLD_DEGREES:
             return []
         return [f"the surface goes on beyond the image, and light that bounces there may turn normals by {self.beyond:.0f}°, which sigma "
                 "holds: take more of it into the picture"]
