@@ -61,6 +61,8 @@ def light_from_beyond(given: SolveInput, lights: Lights, normal: np.ndarray, hei
         along = np.take(solved, -border.last, border.axis)  # where the surface reaches it, by pixel
         reached = np.logical_or.reduceat(along, np.arange(0, len(along), patches.side))
         some = reached[patches.cells[:, 1 - border.axis]]
+        if not some.any():  # too little of a patch reaches it
+            continue
         seen = (directions @ border.turned(directions, given.camera).T).argmax(axis=0)
         mirrored = patches._replace(
             centres=border.mirrored(patches.centres[some], given.camera), facing=border.turned(patches.facing[some], given.camera),

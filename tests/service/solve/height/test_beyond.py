@@ -74,3 +74,13 @@ def test_sigma_holds_light_from_beyond_the_image(tmp_path):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_nothing_is_beyond_a_surface_that_ends_within_the_image(camera):
     assert light_from_beyond(*seen(camera, slice(0, SIDE), margin=1)) is None
+
+
+def test_a_pixel_at_the_border_is_no_surface_beyond_it(monkeypatch):
+    """Patches are of 2 x 2 pixels here, and none that is half solved lies beside it."""
+    monkeypatch.setattr("service.solve.height.interreflection.PATCHES", 8)
+    given, lights, normal, height, solved = seen(CAMERAS["orthographic"], slice(0, SIDE), margin=3)
+    solved[:5] = False
+    solved[0, 0] = True
+    found = light_from_beyond(given, lights, normal, height, solved)
+    assert found is not None and not found.any()
