@@ -56,7 +56,7 @@ class _View(NamedTuple):
 
 def lens_by_boards(corners: Sequence[np.ndarray], board: tuple[int, int], square_m: float, camera: Camera) -> BoardLens | None:
     """Return the lens of a camera by which boards fit best; what is not measured stays. None from fewer than three boards, or where they do
-    not tell. `corners`, `board`: as of `board_plane`, of each board."""
+    not tell. `corners`, `board`: as of `board_surface`, of each board."""
     if len(corners) < LEAST_BOARDS:
         return None
     every = board_points(board, square_m).astype(float)
