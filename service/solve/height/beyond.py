@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.photometric.lambertian.readings import Lights
-from service.solve.base.solution import SolveInput
 from service.solve.height.height import projection_of
-from service.solve.height.interreflection import patches_of
+from service.solve.height.interreflection import Patches
 from stage.capture.camera import Camera
 
 
@@ -45,17 +43,16 @@ class Border(NamedTuple):
         return across, 0.0 if perspective else float(across @ [x, y, 0.0])
 
 
-def light_from_beyond(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> np.ndarray | None:
-    """Return the light that mirror images of the surface beyond the borders that it reaches would throw on each patch of it,
-    [patches, 3, lights] as of `ArrivingLight`, or None where it reaches no border; parameters as of `arriving_light`.
+def light_from_beyond(patches: Patches, camera: Camera, directions: np.ndarray, height: wp.array, solved: np.ndarray) -> np.ndarray | None:
+    """Return the light that mirror images of a surface beyond the borders that it reaches would throw on each patch of it,
+    [patches, 3, lights] as of `ArrivingLight`, or None where it reaches no border.
+    `directions`: [lights, 3] to the lights. `height`: [rows, cols] float32 on the device. `solved`: [rows, cols] bool, the surface.
 
     A mirror image under a light looks as the surface does under the mirrored light, or the one next to that."""
     borders = [border for border in (Border(axis, last) for axis in (0, 1) for last in (False, True))
                if np.take(solved, -border.last, border.axis).any()]
-    patches = patches_of(given, lights, normal, height, solved) if borders else None
-    if patches is None:
+    if not borders:
         return None
-    directions = lights.direction[:given.stack.light_count]
     light = np.zeros_like(patches.radiance)
     for border in borders:
         along = np.take(solved, -border.last, border.axis)  # where the surface reaches it, by pixel
@@ -63,9 +60,9 @@ def light_from_beyond(given: SolveInput, lights: Lights, normal: np.ndarray, hei
         some = reached[patches.cells[:, 1 - border.axis]]
         if not some.any():  # too little of a patch reaches it
             continue
-        seen = (directions @ border.turned(directions, given.camera).T).argmax(axis=0)
+        seen = (directions @ border.turned(directions, camera).T).argmax(axis=0)
         mirrored = patches._replace(
-            centres=border.mirrored(patches.centres[some], given.camera), facing=border.turned(patches.facing[some], given.camera),
+            centres=border.mirrored(patches.centres[some], camera), facing=border.turned(patches.facing[some], camera),
             areas=patches.areas[some], cells=patches.cells[some], radiance=patches.radiance[some][:, :, seen])
-        light += mirrored.light_on(patches, height, projection_of(given.camera))
+        light += mirrored.light_on(patches, height, projection_of(camera))
     return light

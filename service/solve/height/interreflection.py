@@ -85,6 +85,10 @@ class Patches(NamedTuple):
                              receivers=None if others is None else (others.centres, others.facing))
         return light.reshape(-1, *self.radiance.shape[1:])
 
+    def arriving(self, height: wp.array, projection: Projection) -> ArrivingLight:
+        """Return the light of these that arrives at each of them; parameters as of `light_on`."""
+        return ArrivingLight(self.light_on(None, height, projection), self.numbers, self.side)
+
 
 def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
     """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.
@@ -94,9 +98,7 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
         height: [rows, cols] float32 on the device.
     """
     patches = patches_of(given, lights, normal, height, solved)
-    if patches is None:
-        return None
-    return ArrivingLight(patches.light_on(None, height, projection_of(given.camera)), patches.numbers, patches.side)
+    return None if patches is None else patches.arriving(height, projection_of(given.camera))
 
 
 def patches_of(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> Patches | None:

@@ -24,7 +24,8 @@ from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
 from service.solve.height.beyond import light_from_beyond
 from service.solve.height.direct_light import DirectLight
-from service.solve.height.interreflection import arriving_light
+from service.solve.height.height import projection_of
+from service.solve.height.interreflection import patches_of
 from service.solve.methods.shadow_light import (
     RELATIVE_NOISE,
     ScaleFit,
@@ -187,7 +188,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     assert light.arriving is not None
     solved, block, middles, whole = within
     pixels = np.flatnonzero(solved)
-    first, albedo, start = normal, light.albedo, normal[:, middles].T
+    first, albedo, start, camera = normal, light.albedo, normal[:, middles].T, light.given.camera
     turned = start
 
     def with_strength() -> tuple[DirectLight, ScaleFit | None]:
@@ -208,18 +209,20 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         again, dimmed = first.copy(), albedo.copy()
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
-        arriving = arriving_light(light.given, light.lights, again, light.height, solved)
+        patches = patches_of(light.given, light.lights, again, light.height, solved)
+        arriving = None if patches is None else patches.arriving(light.height, projection_of(camera))
         light = light._replace(arriving=arriving, albedo=dimmed)
         cost = _cost_of(light, middles, turned, shape, pick)
     settled, fit = with_strength()
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
     doubted = [(1.0, settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale))]
-    beyond = light_from_beyond(light.given, light.lights, again, light.height, solved)
+    directions = light.lights.direction[:light.given.stack.light_count]
+    beyond = None if patches is None else light_from_beyond(patches, camera, directions, light.height, solved)
     if beyond is not None:
         assert settled.arriving is not None
         doubted.append((BEYOND, settled._replace(arriving=settled.arriving._replace(light=settled.arriving.light + beyond))))
     now, *others = (_searched(each, middles, turned, shape, pick)[1].normal for each in (settled, *(each for _, each in doubted)))
-    places = np.stack(np.divmod(middles, light.given.camera.width), axis=1)
+    places = np.stack(np.divmod(middles, camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
     by = [part * np.median(degrees_between(now.T, other.T)[nearest], axis=1) for (part, _), other in zip(doubted, others, strict=True)]
     degrees = np.zeros(solved.size, np.float32)

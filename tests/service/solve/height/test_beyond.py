@@ -10,7 +10,7 @@ import warp as wp
 from kernels.photometric.lambertian.readings import pad_lights
 from service.requests.solve import Method, SolveRequest
 from service.solve.height.beyond import light_from_beyond
-from service.solve.height.interreflection import arriving_light
+from service.solve.height.interreflection import arriving_light, patches_of
 from service.solve.solve import solve
 from stage.capture.camera import Camera
 from stage.pixels import Crop
@@ -39,6 +39,11 @@ def seen(camera, columns, margin):
     return given, pad_lights(LIGHTS, np.ones((len(LIGHTS), 3))), normal, wp.array(height, device="cpu"), solved[:, columns]
 
 
+def beyond_of(given, lights, normal, height, solved):
+    patches = patches_of(given, lights, normal, height, solved)
+    return light_from_beyond(patches, given.camera, LIGHTS, height, solved)
+
+
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("columns", [slice(0, SIDE // 2), slice(SIDE // 2, SIDE)], ids=["left", "right"])
 def test_what_arrives_from_the_side_that_is_not_seen(camera, columns):
@@ -46,7 +51,7 @@ def test_what_arrives_from_the_side_that_is_not_seen(camera, columns):
     are grouped, of which the largest difference is 0.3 %."""
     whole = arriving_light(*seen(camera, slice(0, SIDE), margin=1))
     half = seen(camera, columns, margin=1)
-    beyond, own = light_from_beyond(*half), arriving_light(*half)
+    beyond, own = beyond_of(*half), arriving_light(*half)
     wanted = whole.light[whole.numbers[:, columns][own.numbers >= 0]]
     assert beyond.shape == own.light.shape and own.light.max() < 1e-6 < 0.01 < wanted.max()
     assert beyond == pytest.approx(wanted, rel=5e-3)
@@ -73,7 +78,7 @@ def test_sigma_holds_light_from_beyond_the_image(tmp_path):
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_nothing_is_beyond_a_surface_that_ends_within_the_image(camera):
-    assert light_from_beyond(*seen(camera, slice(0, SIDE), margin=1)) is None
+    assert beyond_of(*seen(camera, slice(0, SIDE), margin=1)) is None
 
 
 def test_a_pixel_at_the_border_is_no_surface_beyond_it(monkeypatch):
@@ -82,5 +87,5 @@ def test_a_pixel_at_the_border_is_no_surface_beyond_it(monkeypatch):
     given, lights, normal, height, solved = seen(CAMERAS["orthographic"], slice(0, SIDE), margin=3)
     solved[:5] = False
     solved[0, 0] = True
-    found = light_from_beyond(given, lights, normal, height, solved)
+    found = beyond_of(given, lights, normal, height, solved)
     assert found is not None and not found.any()
