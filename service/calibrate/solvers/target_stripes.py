@@ -69,7 +69,8 @@ def whole_stripes(stripes: list[list[SeenStripe]], masks: Sequence[np.ndarray]) 
     widths = np.concatenate([seen.width for pair in stripes for seen in pair])
     if not len(widths):
         return stripes
-    return [[seen.within(mask, float(np.median(widths))) for seen in pair] for pair, mask in zip(stripes, masks, strict=True)]
+    width = float(np.median(widths))
+    return [[seen.within(mask, width) for seen in pair] for pair, mask in zip(stripes, masks, strict=True)]
 
 
 def uniform(capture: Capture, correction: Correction, code: str) -> np.ndarray | None:
