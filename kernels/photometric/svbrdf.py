@@ -38,6 +38,7 @@ from kernels.photometric.model.samples import Samples, to_host
 from kernels.photometric.search.certainty import SingleLobe, standard_deviation
 from kernels.photometric.search.descent import WARM, descend
 from kernels.photometric.search.hypotheses import LobeShape, Prior
+from kernels.photometric.search.lobe_shape import UNKNOWN_SPREAD, ShapeSpread
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.refine import refine
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE
@@ -69,7 +70,8 @@ class SvbrdfFit(NamedTuple):
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe: LobeShape | None = None,
                  shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
-                 beside: np.ndarray | None = None, shared_misfit: float = UNKNOWN_SHARE) -> SvbrdfFit:
+                 beside: np.ndarray | None = None, shared_misfit: float = UNKNOWN_SHARE,
+                 shape_spread: ShapeSpread = UNKNOWN_SPREAD) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels; waits for the device.
 
     Args:
@@ -84,23 +86,26 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe:
             prior, is left out, and the surface is taken as Lambertian.
         beside: [steps, n] of normal_search.neighbours; None: no pixel is another's neighbour.
         shared_misfit: share of the misfit that neighbouring pixels have in common, of shared_misfit.shared_misfit.
+        shape_spread: of the shapes that `shape` is the mean of.
     """
     lobe = shape if lobe is None else lobe
     found = find_normals(samples, start, shape=shape, beside=beside, prior=prior)
-    normals, costs = [found.best.normal], [found.best.cost]
-    for nearby in nearby_shapes(shape):
+    normals, costs, others = [found.best.normal], [found.best.cost], nearby_shapes(shape)
+    for nearby in others:
         other = descend(samples, found.best.normal, shape=nearby, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
-    normal, spread = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
+    steps = [(nearby.rough - shape.rough, nearby.slope - shape.slope) for nearby in others]
+    doubt = doubt_of_shape(np.stack(normals), steps, shape_spread.errors(shared_misfit))
+    normal, _ = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
+    spread = np.zeros_like(doubt)
     lone = None
     if single_lobe and prior is None:
         if roughness is None:
             roughness = fit_tinted(samples, found.best.normal, shape=shape).roughness
         single = refine(samples, found.best.normal, roughness, shape=shape)
         kinds = np.stack([np.min(costs, axis=0), SINGLE_LOBE_CHARGE * single.cost])
-        normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE,
-                                         spreads=np.stack([spread, np.zeros_like(spread)]))
+        normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE)
         lone = SingleLobe(model_weights(kinds, temperature=KIND_TEMPERATURE)[1], single.cost, single.openness)
     if prior is None:
         material = fit_material(samples, normal, shape=lobe, shared=shared)
@@ -120,7 +125,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe:
     material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
         spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
-    sigma = standard_deviation(samples, found, normal, spread, lone, shared_misfit)
+    sigma = standard_deviation(samples, found, normal, spread, doubt, lone, shared_misfit)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma,
                      np.sqrt(found.best.cost), mixture)
 
@@ -139,16 +144,25 @@ def model_weights(costs: np.ndarray, *, temperature: float) -> np.ndarray:
     return np.asarray(weights / weights.sum(axis=0))
 
 
-def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float,
-                    spreads: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def doubt_of_shape(normals: np.ndarray, steps: list[tuple[float, float]], errors: tuple[float, float]) -> np.ndarray:
+    """Return the standard errors in degrees, [n] float32, that normals have because the shape of the lobes is not known exactly.
+    `normals`: [1 + steps, n, 3] unit, under the shape and under others. `steps`: what the others differ by, in roughness or in slope.
+    `errors`: of the shape, in roughness and in slope."""
+    variance = np.zeros(normals.shape[1], np.float32)
+    for axis, sigma in enumerate(errors):
+        turned = [(_angles(normals[0], other) / step[axis]) ** 2 for other, step in zip(normals[1:], steps, strict=True) if step[axis]]
+        if turned:
+            variance += sigma**2 * np.mean(turned, axis=0)
+    return np.sqrt(variance)
+
+
+def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of a pixel's normals under several models, by `model_weights`, and their weighted RMS spread in degrees.
-    `normals`: [models, n, 3] unit. `costs`: [models, n]. `spreads`: [models, n] RMS spread, in degrees, of the normals that each model's
-    normal is the mean of; None: of none."""
+    `normals`: [models, n, 3] unit. `costs`: [models, n]."""
     weights = model_weights(costs, temperature=temperature)
     mean = np.einsum("sn,snc->nc", weights, normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    apart = _angles(normals, mean) ** 2 + (0 if spreads is None else spreads**2)
-    spread = np.sqrt(np.einsum("sn,sn->n", weights, apart))
+    spread = np.sqrt(np.einsum("sn,sn->n", weights, _angles(normals, mean) ** 2))
     return mean.astype(np.float32), spread.astype(np.float32)
 
 

@@ -95,13 +95,13 @@ class Stack:
         """Return the stored values and saturation bits of single pixels.
         `pixels`: [n] row-major indices. Returns [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies."""
         channels, lights, count = self.shape
-        values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
+        values = np.empty((channels * lights, len(pixels)), dtype=np.float16)
         touched = max(1, min(PAGE_BYTES * len(pixels), 2 * count))
-        for number, (channel, light) in enumerate(np.ndindex(channels, lights)):
-            if number % max(1, PICK_BYTES // touched) == 0:  # scattered reads keep pages in the process as long as the map lives
-                planes = self._map(values_path(self.folder, self.key), self.shape, np.float16)
-            values[channel, light] = planes[channel, light, pixels]
-        return values, self.pick_saturated(pixels)
+        at_once = max(1, PICK_BYTES // touched)  # scattered reads keep pages in the process as long as the map lives
+        for first in range(0, len(values), at_once):
+            planes = self._map(values_path(self.folder, self.key), self.shape, np.float16).reshape(len(values), count)
+            values[first : first + at_once] = planes[first : first + at_once, pixels]
+        return values.reshape(channels, lights, len(pixels)), self.pick_saturated(pixels)
 
     def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of single pixels, and which readings are usable.

@@ -28,7 +28,7 @@ from kernels.photometric.search.survey import Survey, evidence, noise_of
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
-UNAVERAGED = 0.6
+UNAVERAGED = 0.45
 """Part of the variance of a reading's misfit that remains however many lights there are, for each share of it that neighbouring pixels have
 in common: what pixels share, neighbouring lights share too. Measured, as the numbers below, on path-traced scenes and real objects."""
 FREE = 0.4
@@ -56,11 +56,12 @@ class SingleLobe(NamedTuple):
     openness: np.ndarray  # variance of its normal per unit of noise, squared radians
 
 
-def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, single: SingleLobe | None,
-                       shared: float) -> np.ndarray:
+def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, doubt: np.ndarray,
+                       single: SingleLobe | None, shared: float) -> np.ndarray:
     """Return the standard deviation of the normals of a search in degrees, [n] float32; waits for the device.
-    `normal`: [n, 3] unit, the result, which may be an average of several searches. `spread`: [n] of that average, degrees. `single`: the
-    single lobe, whose curvature and noise count by its weight; None: it takes no part. `shared`: 0…1, of `shared_misfit`."""
+    `normal`: [n, 3] unit, the result, which may be an average of several searches. `spread`: [n] of that average, degrees. `doubt`: [n]
+    degrees, by the shape of the lobes. `single`: the single lobe, whose curvature and noise count by its weight; None: it takes no part.
+    `shared`: 0…1, of `shared_misfit`."""
     lights = samples.light_count
     total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)
     mean = lights * np.maximum(found.best.curvature.astype(np.float64), 1e-12)
@@ -72,7 +73,7 @@ def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, sprea
         alone = noise_of(lights * single.cost.astype(np.float64), surplus)
         around = mixed * around + single.weight * _around(single.openness.astype(np.float64), alone, alike)
         noise = mixed * noise + single.weight * alone
-    variance = np.minimum(around + FREE * spread.astype(np.float64) ** 2, FLATTEST**2)
+    variance = np.minimum(around + mixed * doubt.astype(np.float64) ** 2 + FREE * spread.astype(np.float64) ** 2, FLATTEST**2)
     apart = np.maximum(APART_DEGREES, APART_SIGMAS * np.sqrt(variance))
     softness = 2 * noise + SOFTNESS * total
     judged = np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1)

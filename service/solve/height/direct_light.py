@@ -18,7 +18,7 @@ from kernels.photometric.shadows.bounce import subtract_bounce
 from kernels.photometric.shadows.shadowing import exclude_shadows
 from kernels.surface.shadows import Extent, extent_of
 from service.solve.base.solution import SolveInput
-from service.solve.height.height import integrate, projection_of
+from service.solve.height.height import QUICK, integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
 from service.solve.height.part_scene import Material
 from service.solve.height.parts import numbered, place_parts
@@ -88,7 +88,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     """Find what the object does to its own light, or return None when no pixel is solved.
     `normal`: [3, pixels] float32, found so far. `bouncing`: [3, pixels] albedo of the light that other surfaces send. `parts`: whether
     parts are moved in depth to where their shadows agree with the images; not under near lights."""
-    whole = partial(integrate, given, normal, solved, specular=material.specular, stage="surface")
+    whole = partial(integrate, given, normal, solved, specular=material.specular, options=QUICK, stage="surface")
     surface = whole()
     if surface is None:
         return None

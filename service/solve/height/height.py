@@ -1,5 +1,7 @@
 """Normals → height: of the solved pixels, and from these of the whole mask."""
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 from scipy import ndimage
@@ -12,6 +14,8 @@ from stage.capture.camera import Camera
 
 OPTIONS = IntegrationOptions(discontinuities=True)
 """The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves."""
+QUICK = replace(OPTIONS, tolerance=1e-4)
+"""Those of a surface from which shadows and bounced light are told, and nothing else: its slopes are right to a ten-thousandth."""
 GUESSED_SIGMA = 30.0
 """Standard error, in degrees, of a normal above which its slope is a guess."""
 GUESSED_PART = 0.1
@@ -25,8 +29,8 @@ RINGS = 8
 
 
 def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigma: np.ndarray | None = None,
-              specular: np.ndarray | None = None, cuts: tuple[np.ndarray, np.ndarray] | None = None, stage: str = "height"
-              ) -> Integration | None:
+              specular: np.ndarray | None = None, cuts: tuple[np.ndarray, np.ndarray] | None = None, options: IntegrationOptions = OPTIONS,
+              stage: str = "height") -> Integration | None:
     """Integrate the normals of the solved pixels.
 
     Args:
@@ -34,6 +38,7 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
         specular: [3, pixels] F0: the surface may break where a metal meets a dielectric; None: not known.
         cuts: edges to the right, and edges down, that the surface breaks along besides, [rows, cols] bool each.
+        options: of the integration.
         stage: what the progress calls this work.
 
     Returns:
@@ -46,7 +51,7 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     return integrate_normals(normal.reshape(3, *solved.shape), solved, *camera.plane_views(),
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
                              sigma=None if sigma is None else sigma.reshape(solved.shape), cuts=cuts,
-                             kind=None if specular is None else _metals(specular.reshape(3, *solved.shape)), options=OPTIONS,
+                             kind=None if specular is None else _metals(specular.reshape(3, *solved.shape)), options=options,
                              device=given.device, progress=given.timings.advance_percent)
 
 

@@ -18,7 +18,7 @@ from kernels.photometric.material.mixtures import NO_PAIRS, choose_pairs
 from kernels.photometric.material.shared_materials import choose_materials
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.hypotheses import LobeShape
-from kernels.photometric.search.lobe_shape import choose_lobe_shape
+from kernels.photometric.search.lobe_shape import ShapeSpread, choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
 
@@ -52,6 +52,8 @@ class Kind(NamedTuple):
     """The shape of the lobes under which normals are found."""
     lobe: LobeShape
     """The shape under which materials are fitted."""
+    spread: ShapeSpread
+    """That of the shapes that `shape` is the mean of."""
     materials: np.ndarray | None = None  # [materials, 4] F0 and roughness; None: every pixel has a material of its own
     metals: Metals | None = None
     pairs: np.ndarray = NO_PAIRS  # [pairs, 2, 4] materials that pixels mix
@@ -114,7 +116,7 @@ class Kinds:
             found = choose_lobe_shape(read(spread), normal[:, spread].T, beside=usual)
             if found.tried[found.best] < OWN * found.tried[usual]:
                 self.which[part == number] = len(self.kinds)
-                self.kinds.append(Kind(found.mean, found.best))
+                self.kinds.append(Kind(found.mean, found.best, found.spread))
 
     def find_materials(self, solvable: np.ndarray, read: Read, normal: np.ndarray, width: int, *, metals: bool, mixtures: bool) -> None:
         """Find the materials of each kind, as `Kind.with_materials` does."""

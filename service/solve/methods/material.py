@@ -25,7 +25,7 @@ from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.descent import descend
 from kernels.photometric.search.hypotheses import LobeShape, Prior
 from kernels.photometric.search.light_factors import find_light_factors
-from kernels.photometric.search.lobe_shape import choose_lobe_shape
+from kernels.photometric.search.lobe_shape import UNKNOWN_SPREAD, choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals, neighbours
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE, shared_misfit
 from kernels.photometric.search.survey import QUICK
@@ -97,7 +97,8 @@ class _Walk:
         self._robust = self.result.normal
         self._unknown_bounce: np.ndarray | float = 0.0  # degrees, [pixels], by which an unknown strength of that light turns normals
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._lobe, self._supported, self._pull, self._simpler = LobeShape(), LobeShape(), True, 0.0, Method.LAMBERT
+        self._shape, self._lobe, self._shape_spread = LobeShape(), LobeShape(), UNKNOWN_SPREAD
+        self._supported, self._pull, self._simpler = True, 0.0, Method.LAMBERT
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -145,7 +146,7 @@ class _Walk:
     def _shape_of(self, pixels: np.ndarray, light: DirectLight | None, short_tails: bool | None = None) -> None:
         """Choose the shape of the lobes from some pixels; `short_tails` as of `choose_lobe_shape`."""
         shapes = choose_lobe_shape(self._read(pixels, light), self.result.normal[:, pixels].T, short_tails=short_tails)
-        self._shape, self._lobe = shapes.mean, shapes.best
+        self._shape, self._lobe, self._shape_spread = shapes.mean, shapes.best, shapes.spread
         self.result.facts |= {**lobe_report(self._lobe), "shapes_tried": len(shapes.tried)}
 
     def search(self) -> None:
@@ -216,7 +217,7 @@ class _Walk:
 
     def choose_kinds(self, light: DirectLight | None) -> Kinds:
         """Return the shapes of lobes and the materials that pixels share, without materials where they share none."""
-        kinds = Kinds(Kind(self._shape, self._lobe), self._given.stack.pixel_count)
+        kinds = Kinds(Kind(self._shape, self._lobe, self._shape_spread), self._given.stack.pixel_count)
         if light is None or not (self._options.sharing and self._supported):
             return kinds
         read, normal, options = partial(self._read, light=light), self.result.normal, self._options
@@ -254,7 +255,7 @@ class _Walk:
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=kind.shape, lobe=kind.lobe, shared=kind.materials,
                                  pairs=kind.pairs, metals=kind.metals, roughness=roughness, prior=self._prior(pixels),
-                                 beside=self._beside(pixels), shared_misfit=shared)
+                                 beside=self._beside(pixels), shared_misfit=shared, shape_spread=kind.spread)
             result.normal[:, pixels] = found.normal.T
             plain = self._matt or self._pull > 0
             material = fit_given(samples, found.normal, MATT, shape=kind.lobe) if plain else found

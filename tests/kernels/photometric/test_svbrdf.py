@@ -14,9 +14,9 @@ from kernels.photometric.material.material import fit_material
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.model.samples import gather, to_host
 from kernels.photometric.search.hypotheses import LobeShape, search_normals
-from kernels.photometric.search.lobe_shape import choose_lobe_shape
+from kernels.photometric.search.lobe_shape import ROUGH_STEP, SLOPE_STEP, ShapeSpread, choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
-from kernels.photometric.svbrdf import average_normals, nearby_shapes, solve_svbrdf
+from kernels.photometric.svbrdf import average_normals, doubt_of_shape, nearby_shapes, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, store
 from tests.reference import hypotheses
 from tests.reference import microfacet as twin
@@ -201,7 +201,7 @@ def test_the_lobe_shape_is_recovered(device, rough, slope):
     roughness and 0.05 in slope apart."""
     normal = tilted(200, 65.0)
     samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope), device)
-    shape, _, tried = choose_lobe_shape(samples, twin.unit(normal + [0.03, 0.02, 0]))
+    shape, _, _, tried = choose_lobe_shape(samples, twin.unit(normal + [0.03, 0.02, 0]))
     assert tried[shape] == min(tried.values())
     chosen = degrees(find_normals(samples, normal, shape=shape).best.normal, normal)
     assert np.median(chosen) < 0.5
@@ -282,16 +282,20 @@ def test_average_of_normals():
     assert none[0] < 0.05
 
 
-def test_an_average_of_averages_spreads_as_all_normals_do():
-    """The spread about a mean of means is that about the mean of all (law of total variance), to the second order of angles of 3°."""
-    normals = twin.unit(np.array([[0.05, 0.0, 1.0], [-0.05, 0.0, 1.0], [0.0, 0.04, 1.0], [0.0, -0.02, 1.0]]))[:, None]
-    costs = np.full((4, 1), 0.1)
-    whole, spread = average_normals(normals, costs, temperature=0.4)
-    parts = [average_normals(normals[pair], costs[pair], temperature=0.4) for pair in (slice(2), slice(2, 4))]
-    mean, again = average_normals(np.stack([part[0] for part in parts]), costs[:2], temperature=0.4,
-                                  spreads=np.stack([part[1] for part in parts]))
-    np.testing.assert_allclose(mean, whole, atol=1e-4)
-    assert again[0] == pytest.approx(spread[0], rel=0.01)
+def test_a_doubtful_shape_turns_normals_by_its_errors():
+    """One pixel is turned by 3 and 5° where the slope is a tenth less and more, and by 6° where the lobe is rougher by 0.15: errors of
+    0.05 and 0.1 are worth half of the RMS of the former and two thirds of the latter."""
+    turned = np.radians([[0.0, 3.0, -5.0, 6.0]])
+    normals = np.stack([np.sin(turned), np.zeros_like(turned), np.cos(turned)], axis=-1).swapaxes(0, 1)
+    found = doubt_of_shape(normals, [(0.0, -0.1), (0.0, 0.1), (0.15, 0.0)], (0.1, 0.05))
+    np.testing.assert_allclose(found, np.hypot(np.sqrt(17) / 2, 4), rtol=1e-5)
+
+
+def test_the_error_of_a_mean_shape_is_its_spread_where_misfit_is_shared():
+    """Noise that no neighbours share leaves half a step of the search."""
+    spread = ShapeSpread(0.3, 0.2)
+    np.testing.assert_allclose(spread.errors(1.0), np.hypot(spread, np.array([ROUGH_STEP, SLOPE_STEP]) / np.sqrt(12)))
+    assert (np.array(spread.errors(0.0)) < np.array([ROUGH_STEP, SLOPE_STEP]) / 2).all()
 
 
 def test_nearby_shapes_are_lobes():

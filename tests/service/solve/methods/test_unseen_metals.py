@@ -5,6 +5,7 @@ import numpy as np
 from kernels.photometric.material.lost_light import account_light
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.search.hypotheses import LobeShape
+from kernels.photometric.search.lobe_shape import UNKNOWN_SPREAD
 from service.solve.base.solution import Solution
 from service.solve.methods.kinds import Kind, Kinds
 from service.solve.methods.unseen_metals import replace_unseen_metals
@@ -39,7 +40,7 @@ def test_a_hollow_is_no_metal_though_its_shadows_hide_the_highlights_of_one(devi
     shown = account_light(samples, normal, of_one_material([0] * 3, GOLD, ROUGHNESS, count=count)).shown
     assert shown[hollow].max() < 0.2 and shown[columns == 8].max() < 0.35  # gold shines where its true normal says
     assert shown[~turned].min() > 0.99  # half floats of the stack
-    kinds = Kinds(Kind(LobeShape(), LobeShape(), SHARED), count)
+    kinds = Kinds(Kind(LobeShape(), LobeShape(), UNKNOWN_SPREAD, SHARED), count)
     changed = replace_unseen_metals(solution, shown, (SIDE, SIDE), kinds, lambda pixels: choose(samples, pixels))
     assert set(changed) <= set(np.flatnonzero(hollow)) and len(changed) >= 4 * SIDE  # the column beside the gold may stay
     assert (solution.specular[:, changed] == np.float16(F0)).all() and solution.facts["unseen_metals"] == len(changed)
