@@ -15,32 +15,37 @@ from stage.capture.camera import Camera
 
 
 class Border(NamedTuple):
-    """One of the four borders of an image, as a mirror through the lines of sight at it."""
+    """One of the four borders of an image."""
 
     axis: int
     """0 for the top and bottom borders, which rows cross, 1 for the left and right ones."""
     last: bool
     """Whether it is that of the last row or column."""
 
-    def turned(self, vectors: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return the mirror images of directions [..., 3]."""
-        across, _ = self._plane(camera)
-        return vectors - 2 * (vectors @ across)[..., None] * across
-
-    def mirrored(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return the mirror images of camera-frame points [..., 3]."""
-        across, offset = self._plane(camera)
-        return points - 2 * (points @ across - offset)[..., None] * across
-
-    def _plane(self, camera: Camera) -> tuple[np.ndarray, float]:
-        """Return the unit normal [3] of the plane, and the distance of the plane from the camera frame's origin along it."""
+    def mirror(self, camera: Camera) -> "Mirror":
+        """Return the plane of the lines of sight at the border."""
         at = np.array([camera.width / 2, camera.height / 2])
         at[1 - self.axis] *= 2 * self.last
         x, y = (float(part[0]) for part in camera.plane_at(*at[:, None]))
         perspective = camera.projection == "perspective"
         across = np.cross([x, y, -1.0] if perspective else [0.0, 0.0, 1.0], [0.0, 1.0, 0.0] if self.axis else [1.0, 0.0, 0.0])
         across = across / np.linalg.norm(across)
-        return across, 0.0 if perspective else float(across @ [x, y, 0.0])
+        return Mirror(across, 0.0 if perspective else float(across @ [x, y, 0.0]))
+
+
+class Mirror(NamedTuple):
+    """A plane that mirrors."""
+
+    across: np.ndarray  # [3] its unit normal
+    offset: float  # its distance from the camera frame's origin along that
+
+    def turned(self, vectors: np.ndarray) -> np.ndarray:
+        """Return the mirror images of directions [..., 3]."""
+        return vectors - 2 * (vectors @ self.across)[..., None] * self.across
+
+    def mirrored(self, points: np.ndarray) -> np.ndarray:
+        """Return the mirror images of camera-frame points [..., 3]."""
+        return points - 2 * (points @ self.across - self.offset)[..., None] * self.across
 
 
 def light_from_beyond(patches: Patches, camera: Camera, directions: np.ndarray, height: wp.array, solved: np.ndarray) -> np.ndarray | None:
@@ -60,9 +65,10 @@ def light_from_beyond(patches: Patches, camera: Camera, directions: np.ndarray, 
         some = reached[patches.cells[:, 1 - border.axis]]
         if not some.any():  # too little of a patch reaches it
             continue
-        seen = (directions @ border.turned(directions, camera).T).argmax(axis=0)
+        mirror = border.mirror(camera)
+        seen = (directions @ mirror.turned(directions).T).argmax(axis=0)
         mirrored = patches._replace(
-            centres=border.mirrored(patches.centres[some], camera), facing=border.turned(patches.facing[some], camera),
+            centres=mirror.mirrored(patches.centres[some]), facing=mirror.turned(patches.facing[some]),
             areas=patches.areas[some], cells=patches.cells[some], radiance=patches.radiance[some][:, :, seen])
         light += mirrored.light_on(patches, height, projection_of(camera))
     return light

@@ -64,12 +64,12 @@ class _Sample(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Lights as pixels see them."""
+    """Lights as pixels see them; where all see the same, one stands for them."""
 
-    direction: np.ndarray  # [lights, pixels, 3] unit
-    half: np.ndarray  # [lights, pixels, 3] unit, between light and viewer
-    rise: np.ndarray  # [lights, pixels] Schlick's rise of Fresnel's reflectance
-    shining: np.ndarray  # [lights, pixels] irradiance for strength 1
+    direction: np.ndarray  # [lights, pixels or 1, 3] unit
+    half: np.ndarray  # [lights, pixels or 1, 3] unit, between light and viewer
+    rise: np.ndarray  # [lights, pixels or 1] Schlick's rise of Fresnel's reflectance
+    shining: np.ndarray  # [lights, pixels or 1] irradiance for strength 1
 
 
 class _Lamps(NamedTuple):
@@ -78,8 +78,8 @@ class _Lamps(NamedTuple):
     way: np.ndarray  # [lights, 3] from the centre, metres; directions of distant lights
     near: np.ndarray  # [lights, 1] 1.0 for near lights, else 0.0
     lobe: np.ndarray  # [lights, 4] unit axis and exponent, as `PlacedLights` has it
-    points: np.ndarray  # [pixels, 3] from the centre, metres
-    view: np.ndarray  # [pixels, 3] unit, to the viewer
+    points: np.ndarray  # [pixels, 3] from the centre, metres; [1, 3] where lights are distant
+    view: np.ndarray  # [pixels, 3] unit, to the viewer; [1, 3] where all are looked at alike
 
     def seen(self, turn: Rotation) -> _Seen:
         """Return the turned lights."""
@@ -153,7 +153,7 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
         return None
     pixels, readings, usable, start, cosine, lit = (
         pixels[chosen], readings[:, chosen], usable[:, chosen], start[chosen], cosine[:, chosen], lit[:, chosen])
-    lamps = lamps._replace(points=lamps.points[chosen], view=lamps.view[chosen])
+    lamps, _ = _lamps(lights, given.camera, height, pixels)
     level = np.maximum(level[chosen], np.median(level[chosen]) / 2)
     sample = _Sample(readings, usable, NOISE * np.sqrt(level * (np.maximum(readings, 0) + DARK * level)), lamps)
     albedo = np.pi * np.nanmedian(np.where(lit, readings / np.where(lit, cosine, 1), np.nan), axis=0)
@@ -176,10 +176,10 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
 def _lamps(lights: DistantLights | PlacedLights, camera: Camera, height: np.ndarray | None,
            pixels: np.ndarray) -> tuple[_Lamps, np.ndarray]:
     """Return lights as some pixels see them, and their strength [lights, 3]. `height`: [rows, cols] metres, where lights are near."""
-    view = view_directions(camera)(pixels).astype(np.float64)
+    view = view_directions(camera)(pixels if camera.projection == "perspective" else pixels[:1]).astype(np.float64)
     if isinstance(lights, DistantLights):
         none = np.zeros((len(lights.direction), 4))
-        return _Lamps(lights.direction, none[:, :1], none, np.zeros((len(pixels), 3)), view), lights.irradiance
+        return _Lamps(lights.direction, none[:, :1], none, np.zeros((1, 3)), view), lights.irradiance
     assert height is not None  # near lights have found it with the normals
     near, points = lights.place[:, 3:], camera.points_at(pixels, height.reshape(-1)[pixels])
     return _Lamps(lights.place[:, :3] - near * lights.centre, near, lights.lobe, points - lights.centre, view), lights.strength
