@@ -309,12 +309,12 @@ class Guide:
         first = int(batch.pixels[0])
         seen = self._seen.get(first)
         if seen is None:
-            seen = self._model.see(self._place, batch.pixels)
+            seen = self._model.see(self._place, batch)
             if self._keep:
                 self._seen[first] = seen
         if not len(marched):
             return seen
         both = wp.empty((seen.shape[0] + len(marched), seen.shape[1]), dtype=seen.dtype, device=self._model.device)
         wp.copy(both, seen, count=seen.size)
-        wp.copy(both, self._model.see(marched, batch.pixels), dest_offset=seen.size)
+        wp.copy(both, self._model.see(marched, batch), dest_offset=seen.size)
         return both

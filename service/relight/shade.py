@@ -135,7 +135,7 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
     timings.stage("shade", len(model.pixels))
     done = 0
     for batch in model.batches():
-        lit = model.lit(batch, light, model.see(rows, batch.pixels))
+        lit = model.lit(batch, light, model.see(rows, batch))
         frame[:, batch.pixels], specular[:, batch.pixels] = lit[:3] + lit[3:], lit[3:]
         done += len(batch.pixels)
         timings.advance(done)

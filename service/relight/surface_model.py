@@ -195,15 +195,11 @@ class SurfaceModel:
         assert self.maps.height is not None
         return self.maps.camera.points_at(pixels, self.maps.height.reshape(-1)[pixels])
 
-    def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
-        """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.
-
-        Args:
-            place: [n, 4] direction and 0, or position and 1.
-            pixels: [m] of a batch.
-        """
-        return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, thickness=self._thickness,
-                          device=self.device)
+    def see(self, place: np.ndarray, batch: ModelBatch) -> wp.array:
+        """Return which pixels of a batch see which lights, as [n, P] uint8 packs of 255 or 0; those that do not face a light, 255.
+        `place`: [n, 4] direction and 0, or position and 1."""
+        return see_lights(place, batch.pixels, self._height, self._mask, self._projection, extent=self._extent, thickness=self._thickness,
+                          surface=batch.surface, device=self.device)
 
     def _guessed_thickness(self) -> wp.array:
         """Return how thick the parts are taken to be, on the device."""

@@ -136,7 +136,7 @@ def _write_model(model: SurfaceModel, lights: DistantLights | PlacedLights, grid
 def _lit(model: SurfaceModel, batch: ModelBatch, sources: Sources, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Return [n, lights, 3] half radiance of a batch under each light, over the scale, and [n, lights] uint8 flags."""
     count, pixels = sources.count, len(batch.pixels)
-    visible = model.see(sources.place, batch.pixels)
+    visible = model.see(sources.place, batch)
     values = np.empty((pixels, count, 3), dtype=np.float16)
     for light in range(count):
         one = Sources(*(plane[light : light + 1] for plane in sources))

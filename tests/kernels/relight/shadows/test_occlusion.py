@@ -6,8 +6,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.relight.model.shading import upload_surface
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, Projection
+from tests.reference.sampling import lattice
 
 SIDE = 64
 BLOCK = slice(20, 44), slice(40, 52)
@@ -44,6 +46,24 @@ def seen(place, pixels, height, projection, device, mask=None):
     assert set(np.unique(got)) <= {0, 255}
     got = got.reshape(len(place), got.shape[1] * got.shape[2]) == 255
     return got[:, : len(pixels)], got[:, len(pixels) :]
+
+
+def test_a_ball_hides_no_light_from_itself(device):
+    """What it hides from pixels behind it is attached shadow, which says nothing of other lights."""
+    radius = 0.4 * SIDE
+    row, col = np.indices((SIDE, SIDE)) + 0.5 - SIDE / 2
+    z = np.sqrt(np.maximum(radius**2 - row**2 - col**2, 0))
+    mask = z > 0.1 * radius
+    normal = np.stack([col, -row, z], axis=-1)[mask] / radius
+    pixels, height, lights = np.flatnonzero(mask), wp.array(z.astype(np.float32), dtype=wp.float32, device=device), lattice(32, 120)
+    count = len(pixels)
+    surface = upload_surface(normal, np.ones((count, 3)), np.zeros((count, 3)), np.ones((count, 1)), np.tile([0.0, 0.0, 1.0], (count, 1)),
+                             np.zeros((count, 3)), device=device)
+    args = (np.pad(lights, ((0, 0), (0, 1))), pixels, height, wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device), flat())
+    assert (see_lights(*args, surface=surface, device=device).numpy() == 255).all()
+    behind = (lights @ normal.T < -0.1)
+    alone = see_lights(*args, device=device).numpy().reshape(len(lights), -1)[:, :count]
+    assert behind.mean() > 0.2 and (alone[behind] == 0).mean() > 0.8  # at the rim lines leave the picture at once
 
 
 def far(*direction):
