@@ -41,7 +41,7 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     packs = -(-len(pixels) // pack)
     where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)]
     visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
-    normals = wp.empty((0, packs), dtype=pack_type(pack, wp.float32), device=device) if surface is None else surface.values
+    normals = wp.empty((0, packs), dtype=pack_type(pack, wp.float32), device=device) if surface is None else surface.values[:3]
     devices.launch(_see_kernel(pack), len(place) * packs,
                    [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device), normals,
                     relief_of(height, mask, projection, extent, thickness)], [visible], device=device, uneven=True)
@@ -57,7 +57,7 @@ def _see_kernel(pack: int) -> Any:
     def see_kernel(first: int,
                    places: wp.array(dtype=wp.vec4),  # [N]
                    pixels: wp.array(dtype=wp.int32),  # [P · pack]
-                   normals: wp.array2d(dtype=lane_type),  # [3 or more, P]; none: they are not looked at
+                   normals: wp.array2d(dtype=lane_type),  # [3, P]; none: they are not looked at
                    relief: Relief,
                    # outputs
                    visible: wp.array2d(dtype=byte_pack)):  # [N, P]
