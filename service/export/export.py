@@ -23,6 +23,7 @@ from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata, other_manifest
 from service.requests.export import AssetFormat, ExportRequest, Geometry, TextureFormat
+from service.solve.base.solution import doubtful_normals
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
@@ -42,8 +43,9 @@ OPTIONS = ("rig", "environment", "card")
 """Options of what an asset brings along."""
 BLACK = 1e-3
 """Sum of diffuse albedo and F0 below which a surface looks black: an image of 8 bits has three codes up to it."""
-EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "part")
-"""The layers that an asset needs, half of those that `svbrdf` writes: at 4096 by 4096 pixels the rest takes 0.6 GiB."""
+EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "part", "status")
+"""The layers that an asset needs and what tells whether normals are sure, half of those that `svbrdf` writes: at 4096 by 4096 pixels the
+rest takes 0.6 GiB."""
 LINEAR = "lin_rec709_scene"
 OF_ONE_STEP = ("relit:capture", "relit:inputs")
 """Provenance that steps do not share; the asset has a hash of the results of all."""
@@ -119,6 +121,8 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
         warnings.append(plain)
     if around.rig is not None and (doubt := other_manifest(maps, around.rig, path)) is not None:
         warnings.append(doubt)
+    if maps.status is not None and (doubtful := doubtful_normals(maps.status)) is not None:
+        warnings.append(doubtful)
     if maps.diffuse_albedo is None:
         warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
     warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"

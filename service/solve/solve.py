@@ -16,7 +16,7 @@ from service.reporting.provenance import HASHING, LIGHTS, REPORT_FILE, hash_of_l
 from service.requests.solve import MAX_SIGMA, Materials, Method, SolveRequest
 from service.sharing.sharing import SharedSolve
 from service.solve.albedo_scale import scale_albedo
-from service.solve.base.solution import Solution, SolveInput, SuspectLight, mark_not_facing, raise_error, refine_status
+from service.solve.base.solution import Solution, SolveInput, SuspectLight, doubtful_normals, mark_not_facing, raise_error, refine_status
 from service.solve.coherent_materials import agree_on_materials
 from service.solve.height import integrability
 from service.solve.height.height import guessed_part, height_warnings, integrate
@@ -38,8 +38,6 @@ from stage.files import write_text
 from stage.results.maps import ALBEDO_SCALE, MAPS_FILE, SurfaceMaps
 from stage.stack.ingest import LAYOUT
 
-MANY_AMBIGUOUS = 0.25
-"""Part of the solved pixels with an ambiguous normal from which it is said."""
 MANY_ABOVE_ONE = 0.01
 """Part of the solved pixels with an albedo above 1 from which it is said: noise and highlights reach that at less."""
 SURELY_ABOVE = 2.0
@@ -168,12 +166,8 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
         solution.warnings.append(_above_one(above / solved.sum(), capture, shining=solution.specular is None))
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
-    elif not counts[Status.OK.name.lower()]:
-        solution.warnings.append("no normal is sure to five degrees: all that are solved are ambiguous or not_converged, and the layer "
-                                 "sigma says how far each is off")
-    elif (share := counts[Status.AMBIGUOUS.name.lower()] / solved.sum()) > MANY_AMBIGUOUS:
-        solution.warnings.append(f"{100 * share:.0f} % of the solved normals are ambiguous, with a standard error above five degrees: the "
-                                 "layer sigma says how far each is off")
+    elif (doubtful := doubtful_normals(status)) is not None:
+        solution.warnings.append(doubtful)
     solution.warnings += height_warnings(judged.guessed, method, mask)
     outdated = devices.outdated_driver() if request.device is None else None
     solution.warnings += [outdated] if outdated else []

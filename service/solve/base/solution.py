@@ -13,7 +13,7 @@ from kernels.images import ImagesOnDevice
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import evenly
-from kernels.status import ESTIMATED, Status, refuse_unsure
+from kernels.status import ESTIMATED, SOLVED, Status, refuse_unsure
 from kernels.surface.integrate import Integration
 from service.light_estimation.lambertian import LEAST_PIXELS, suspects
 from service.reporting.progress import Timings
@@ -25,6 +25,8 @@ from stage.stack.stack import Stack
 
 AMBIGUOUS_DEGREES = 5.0
 """Standard error of a normal above which it is ambiguous."""
+MANY_AMBIGUOUS = 0.25
+"""Part of the solved pixels with an ambiguous normal from which it is said."""
 NEIGHBOURS = 8
 """Samples from which the error of a pixel between them is taken."""
 PIXELS_AT_ONCE = 1 << 16
@@ -193,6 +195,18 @@ def at_all_pixels(mask: np.ndarray, sampled: np.ndarray, values: np.ndarray) -> 
         _, nearest = tree.query(np.stack(np.divmod(inside, mask.shape[1]), axis=1), k=range(1, min(NEIGHBOURS, len(sampled)) + 1))
         found[inside] = np.sqrt((values**2)[nearest].mean(axis=-1))
     return found
+
+
+def doubtful_normals(status: np.ndarray) -> str | None:
+    """Return the sentence for maps of whose solved pixels many are ambiguous, or none is sure, by the status of their pixels; else None."""
+    solved, sure, ambiguous = (int(np.isin(status, kinds).sum()) for kinds in (SOLVED, Status.OK, Status.AMBIGUOUS))
+    if solved and not sure:
+        return ("no normal is sure to five degrees: all that are solved are ambiguous or not_converged, and the layer sigma says how far "
+                "each is off")
+    if ambiguous <= MANY_AMBIGUOUS * solved:
+        return None
+    return (f"{100 * ambiguous / solved:.0f} % of the solved normals are ambiguous, with a standard error above five degrees: the layer "
+            "sigma says how far each is off")
 
 
 def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pxr import Usd
 
+from kernels.status import Status
 from service.asset.usd.asset import write_asset
 from service.asset.usd.inspect import inspect_usd
 from tests.scenes.captures import write_exr
@@ -137,3 +138,12 @@ def test_an_asset_that_is_grey_or_clipped_is_said_and_a_version_is_a_text(relit,
     assert f"{BALL.mask.sum()} pixels have a value outside 0…1" in relit("export", tmp_path, "--out", tmp_path / "a.usdz").well()
     outcome = relit("export", tmp_path, "--out", tmp_path / "b.usdz", "--version", "")
     assert outcome.code == 2 and "version" in outcome.err and not (tmp_path / "b.usdz").exists()
+
+
+@pytest.mark.parametrize(("ambiguous", "words"), [(1.0, "no normal is sure"), (0.5, "% of the solved normals are ambiguous"), (0.1, None)])
+def test_normals_that_are_not_sure_are_said_again(relit, tmp_path, ambiguous, words):
+    chosen = np.random.default_rng(0).permutation(BALL.mask.size).reshape(BALL.mask.shape) < ambiguous * BALL.mask.size
+    status = np.where(BALL.mask, np.where(chosen, Status.AMBIGUOUS, Status.OK), Status.UNSOLVED).astype(np.uint8)
+    dataclasses.replace(BALL, status=status).write(tmp_path / "maps.exr")
+    out = relit("export", tmp_path, "--out", tmp_path / "a.usdz").out
+    assert ("warning" in out) == (words is not None) and (words or "") in out
