@@ -15,7 +15,7 @@ from tests.reference.projector import FLIP
 from tests.scenes import stereo
 from tests.scenes.captures import files_in, write_image
 from tests.scenes.depth import AMBIENT, CAMERA, POSE, PROJECTOR, make_scene
-from tests.scenes.stereo import Plane, Sphere
+from tests.scenes.projected import Ball, Wall
 
 SCENE = make_scene()
 LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded
@@ -228,7 +228,7 @@ def test_without_a_calibration_the_columns_are_decoded_all_the_same(relit, tmp_p
 @pytest.fixture(scope="module")
 def pair():
     """Both views of a tilted plane and a sphere under dots, whether the second camera sees the place, and what is recorded."""
-    parts, dots = (Plane((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0)), Sphere((0.08, -0.04, -0.95), 0.11)), [stereo.dots(100, cell=3)]
+    parts, dots = (Wall((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.6), Ball((0.08, -0.04, -0.95), 0.11, 0.6)), [stereo.dots(100, cell=3)]
     left, right = (stereo.render(parts, dots, *camera, side=2) for camera in ((stereo.CAMERA,), (stereo.OTHER, stereo.POSE)))
     random = np.random.default_rng(0)
     return left, stereo.visible_to(parts, left.points, stereo.POSE), [stereo.recorded(view.images[0], random) for view in (left, right)]

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
 from kernels.status import Status
 from stage.patterns.base import uniform_patterns
 from stage.patterns.binary import binary_patterns
@@ -14,6 +13,7 @@ from stage.patterns.kary import kary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.patterns.ramp import ramp_patterns
 from stage.results.depth_maps import DepthMaps
+from tests.scenes.projected import Ball, Rig, Wall, World, trace, write_capture
 
 RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)
 ROOM = World(shapes=(Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.4), Ball((0.12, -0.05, -1.2), 0.16, 0.8)), rig=RIG)

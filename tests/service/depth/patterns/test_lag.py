@@ -6,10 +6,10 @@ Neither appears on matt things that are textured, dark or out of focus. The ligh
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Light, Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from tests.scenes.depth import depth_of
+from tests.scenes.projected import Ball, Light, Rig, Wall, World, trace, write_capture
 
 pytestmark = pytest.mark.long
 RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)

@@ -14,15 +14,16 @@ from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest
-from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
+from tests.scenes.projected import Ball, Wall, rectangle
+from tests.scenes.stereo import CAMERA, OTHER, POSE
 
-TILTED = Plane((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.7)
+TILTED = Wall((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.7)
 PARTS = {
-    "plane and sphere": (TILTED, Sphere((0.08, -0.04, -0.95), 0.11, 0.5)),
-    "one before the other": (Plane((0, 0, -1.3), (0.1, 0.05, 1)), Rectangle((-0.16, 0.02), (-0.12, 0.1), 0.9),
-                             Rectangle((0.1, 0.2), (-0.3, 0.05), 1.1)),
-    "thin": (Plane((0, 0, -1.1), (0, 0.1, 1)), Rectangle((-0.1, -0.096), (-0.3, 0.3), 0.9), Rectangle((0.05, 0.06), (-0.3, 0.3), 0.9)),
-    "dark and bare": (TILTED, Rectangle((-0.2, -0.05), (-0.1, 0.1), 0.95, 0.002)),
+    "plane and sphere": (TILTED, Ball((0.08, -0.04, -0.95), 0.11, 0.5)),
+    "one before the other": (Wall((0, 0, -1.3), (0.1, 0.05, 1), 0.6), rectangle((-0.16, 0.02), (-0.12, 0.1), 0.9),
+                             rectangle((0.1, 0.2), (-0.3, 0.05), 1.1)),
+    "thin": (Wall((0, 0, -1.1), (0, 0.1, 1), 0.6), rectangle((-0.1, -0.096), (-0.3, 0.3), 0.9), rectangle((0.05, 0.06), (-0.3, 0.3), 0.9)),
+    "dark and bare": (TILTED, rectangle((-0.2, -0.05), (-0.1, 0.1), 0.95, 0.002)),
 }
 
 

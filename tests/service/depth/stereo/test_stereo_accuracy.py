@@ -16,11 +16,12 @@ from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest, write_exr
 from tests.scenes.depth import entry_of
-from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
+from tests.scenes.projected import Ball, Wall, rectangle
+from tests.scenes.stereo import CAMERA, OTHER, POSE
 from tests.service.depth.stereo.test_stereo import pixels_off, solve
 
 pytestmark = pytest.mark.long
-WALL, BALL = Plane((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Sphere((-0.06, 0.05, -0.88), 0.1, 0.55)
+WALL, BALL = Wall((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Ball((-0.06, 0.05, -0.88), 0.1, 0.55)
 ABOVE = np.eye(4)
 ABOVE[:3, 3] = (0.01, 0.1, 0.0)
 TO_THE_LEFT = reference.look_at((-0.11, -0.01, 0.004), (0.01, 0.0, -1.0))
@@ -82,8 +83,8 @@ def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
 
 @pytest.mark.parametrize("textures", [1, 4])
 def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
-    bars = [Rectangle(x, (-0.3, 0.3), depth) for x, depth in (((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9))]
-    left, right = pair((Plane((0, 0, -1.15), (0.05, 0.1, 1)), *bars), textures)
+    bars = [rectangle(x, (-0.3, 0.3), depth) for x, depth in (((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9))]
+    left, right = pair((Wall((0, 0, -1.15), (0.05, 0.1, 1), 0.6), *bars), textures)
     maps, _ = solve(relit, scenes.write_pair(tmp_path, recorded(left, 5), recorded(right, 6)))
     off = np.abs(pixels_off(maps, left.depth))
     for index, least in ((1, 0.0), (2, 0.0), (3, 0.5)):  # 2.3, 7.4 and 19 pixels wide
@@ -103,7 +104,7 @@ def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
 
 
 def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
-    parts = Plane((0, 0, -1.2), (0.1, 0.05, 1)), Rectangle((-0.1, 0.05), (-0.12, 0.1), 0.85)
+    parts = Wall((0, 0, -1.2), (0.1, 0.05, 1), 0.6), rectangle((-0.1, 0.05), (-0.12, 0.1), 0.85)
     left, right = pair(parts)
     _, third = pair(parts, 1, 3, TO_THE_LEFT)
     folder = scenes.write_pair(tmp_path / "two", recorded(left, 9), recorded(right, 10))
@@ -128,7 +129,7 @@ def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
 def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
     """Texture and lights in one capture: `solve`, `depth` and `join` speak of the same pixels."""
     left, right = pair((WALL, BALL), 3)
-    normal = np.where((left.part == 1)[..., None], (left.points - BALL.centre) / BALL.radius, WALL.normal / np.linalg.norm(WALL.normal))
+    normal = np.where((left.part == 1)[..., None], (left.points - BALL.center_m) / BALL.radius_m, WALL.normal / np.linalg.norm(WALL.normal))
     directions = [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0, -0.5, 1), (0.35, 0.35, 1)]
     further = []
     for index, direction in enumerate(np.array(directions) / np.linalg.norm(directions, axis=1, keepdims=True)):
