@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError
-from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_images, write_manifest
 from tests.scenes.depth import entry_of
@@ -66,14 +65,12 @@ def test_planes_are_found_and_measure_an_object(relit, tmp_path):
         off = np.degrees(np.arccos(min(1.0, abs(np.array(laser.normal) @ unit(normal)))))
         assert off < 0.5 and off < 5 * entry["sigma_degrees"] + 0.1, (off, entry)
         assert abs((np.array(laser.point_m) - point) @ unit(normal)) < 0.002
-    assert relit("depth", scan, "--out", tmp_path / "out", "--device", "cpu").code == 0
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps, measured, _ = relit.depth(scan, "--device", "cpu")
     error = np.abs(maps.depth - truth)[maps.mask]
     assert maps.mask.sum() > 300 and np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.01
     # σ holds how far the planes are known: |e| / σ is 0.67 in the median if it is right, and at most 3 where errors are normal
     assert np.median(error / maps.sigma[maps.mask]) < 1 and np.quantile(error / maps.sigma[maps.mask], 0.99) < 3
-    assert not any("whether its planes are right" in words for words in json.loads((tmp_path / "out" / "report.json").read_text()).get(
-        "warnings", ()))
+    assert not any("whether its planes are right" in words for words in measured.get("warnings", ()))
 
 
 @pytest.mark.long

@@ -12,7 +12,6 @@ from service.depth.stereo.rectification import rectify
 from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.formats.images import read_pixels
-from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_image, write_images, write_manifest
 from tests.scenes.depth import BLACK_WHITE, entries_of, entry_of, phase_patterns, shown
@@ -85,8 +84,7 @@ def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     report = json.loads((folders[0] / "calibration.json").read_text())["procam"]
     assert manifest.projector.depth_sigma == report["sigma"]["depth"] > 0
     assert len(report["views"]) == 5 and report["rms_px"] < 0.3 and report["left_out"] == []
-    relit.done("depth", folders[0], "--out", tmp_path, "--read-noise", 0.0003)
-    maps = DepthMaps.read(tmp_path / "depth.exr")
+    maps, *_ = relit.depth(folders[0], "--read-noise", 0.0003)
     corners = np.s_[100:200, 140:260]  # the board is in the middle
     assert maps.mask[corners].mean() > 0.9
     off = np.abs(maps.depth + points[..., 2])[corners][maps.mask[corners]]
@@ -147,8 +145,7 @@ def test_what_is_wrong_is_said(relit, rig, tmp_path):
     assert said.startswith("relit: --square-m 75: is 75 m, ") and "0.075 for 75 mm" in said and said.count("\n") == 1
     write_view(tmp_path / "one", next(boards.poses(1)))
     assert "--projector WIDTHxHEIGHT" in refused(tmp_path / "one", *given, "9x6")
-    data = json.loads((tmp_path / "one" / "capture.json").read_text())
-    edit_manifest(tmp_path / "one", frames=[frame for frame in data["frames"] if frame["pattern"].get("axis") != "row"])
+    edit_manifest(tmp_path / "one", frames=lambda frames: [frame for frame in frames if frame["pattern"].get("axis") != "row"])
     assert "no row code" in refused(tmp_path / "one", *given, "9x6", "--projector", "256x192")
 
 
@@ -166,8 +163,7 @@ def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, copies, tmp
 def test_poses_with_phases_alone_calibrate(relit, copies):
     """The mean of a wave over its shifts is the image under even light, in which the corners are found: no white frame is needed."""
     for folder in copies:
-        frames = json.loads((folder / "capture.json").read_text())["frames"]
-        edit_manifest(folder, frames=[frame for frame in frames if frame["pattern"]["code"] == "phase"])
+        edit_manifest(folder, frames=lambda frames: [frame for frame in frames if frame["pattern"]["code"] == "phase"])
     manifest, report = calibrated(relit, copies, *WORDS)
     assert len(report["views"]) == 5 and report["rms_px"] < 0.3 and focal_off(manifest.projector, PROJECTOR) < 0.01  # as with white
 

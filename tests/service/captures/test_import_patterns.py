@@ -9,7 +9,6 @@ import pytest
 from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.importers.opencv_file import read_matrices
-from stage.results.depth_maps import DepthMaps
 from tests.marks import first_short
 from tests.reference.projector import FLIP
 from tests.scenes import stereo
@@ -66,8 +65,7 @@ SIZES = {"frameWidth": CAMERA.width, "frameHeight": CAMERA.height, "screenResX":
 def depth_of(relit, folder, *words):
     """Import a folder, solve it, and return the result and what was printed."""
     out = relit("import", words[0], folder, *words[1:]).well()
-    relit("depth", folder, "--out", folder / "out").well()
-    return DepthMaps.read(folder / "out" / "depth.exr"), out
+    return relit.depth(folder).maps, out
 
 
 def error(maps):
@@ -265,8 +263,7 @@ def test_two_cameras(relit, tmp_path, pair, kind):
     if kind != "one file":  # alike from here on
         return
     assert other.name == "cam.1"
-    relit("depth", tmp_path / "pair", "--out", tmp_path / "out").well()
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps, *_ = relit.depth(tmp_path / "pair")
     off = np.abs(maps.depth - left.depth)[maps.mask & visible]  # a pixel of disparity is 19 to 27 mm at 1 to 1.2 m
     assert maps.mask[visible].mean() > 0.7 and np.median(off) < 0.006 and (off > 0.03).mean() < 0.02
 

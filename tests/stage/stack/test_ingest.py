@@ -1,6 +1,5 @@
 """Ingest: the layout of the cache, when it is rebuilt, and that it is whole or not there."""
 
-import json
 import os
 
 import numpy as np
@@ -10,7 +9,7 @@ from stage.capture.capture import Capture
 from stage.errors import ManifestError, StorageError
 from stage.stack import stack
 from stage.stack.ingest import Ingest, open_stack
-from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=9, lights=5)
 PIXELS, LIGHTS = 81, 5
@@ -110,15 +109,11 @@ def change_dark(folder):
 
 
 def change_mask(folder):
-    from tests.scenes.captures import write_image
-
     write_image(folder / "mask.png", np.full((9, 9), 255, np.uint8))
 
 
 def swap_frames(folder):
-    data = json.loads((folder / "capture.json").read_text())
-    data["frames"][0], data["frames"][1] = data["frames"][1], data["frames"][0]
-    (folder / "capture.json").write_text(json.dumps(data))
+    edit_manifest(folder, frames=lambda frames: [frames[1], frames[0], *frames[2:]])
 
 
 @pytest.mark.parametrize("change", [
