@@ -29,7 +29,12 @@ def photograph(folder, points, albedo, planes=PLANES, noise=0.002):
         glow = 0.0 if plane is None else 0.6 * np.exp(-(((points - plane[0]) @ unit(plane[1])) ** 2) / (2 * WIDTH**2))
         image = albedo * (0.2 + glow)
         images.append(np.maximum(image + random.normal(0, noise, image.shape), 0))
-    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * len(planes), {"light": {"type": "off"}}], "{}.exr")
+    return written(folder, images)
+
+
+def written(folder, images):
+    """A capture whose last image is under the light of the room, and the others under lasers that are still to be calibrated."""
+    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * (len(images) - 1), {"light": {"type": "off"}}], "{}.exr")
     write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "camera": {"projection": "perspective", **entry_of(CAMERA)},
                             "frames": frames})
     return folder
@@ -39,8 +44,7 @@ def boards(folder, chosen=POSES, planes=PLANES):
     rays = reference.pixel_rays(CAMERA)
     found = []
     for number, pose in enumerate(chosen):
-        normal = pose[:3, 2]
-        points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+        points = rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None]
         found.append(photograph(folder / f"pose{number}", points, board_image(pose), planes))
     return found
 

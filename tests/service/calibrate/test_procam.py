@@ -38,8 +38,7 @@ def write_view(folder, pose, radiance=None, **manifest):
     """One pose of the board under phases of both axes: with Gray codes it would be 34 images."""
     radiance = boards.board_image(pose) if radiance is None else radiance
     rays = reference.pixel_rays(CAMERA)
-    normal = pose[:3, 2]
-    points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+    points = rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None]
     uv = reference.seen_by(PROJECTOR, boards.POSE, points)
     reached = ((uv >= 0) & (uv < (PROJECTOR.width, PROJECTOR.height))).all(axis=-1)
     images = [radiance * (0.02 + 0.9 * np.where(reached, shown(pattern, uv), 0)) for pattern in PATTERNS]

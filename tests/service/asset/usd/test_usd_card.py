@@ -15,6 +15,7 @@ from tests.clients.validators import findings
 from tests.scenes.captures import write_radiance
 from tests.scenes.surfaces import make_wave
 from tests.scenes.surroundings import COVERAGE, write_frames
+from tests.service.asset.usd.test_usd_rig import pixels_of_vertices
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 RADIANCE = np.random.default_rng(5).random((8, 16, 3)).astype(np.float32)
@@ -42,13 +43,10 @@ def test_the_card_fills_the_picture_of_the_camera(maps, tmp_path):
     usd_stage, _ = export(tmp_path, maps)
     assert [prim.GetPath().pathString for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh)] == ["/A/Geom/Card"]
     card = UsdGeom.Mesh(usd_stage.GetPrimAtPath("/A/Geom/Card"))
-    frustum = UsdGeom.Camera(usd_stage.GetPrimAtPath("/A/Camera")).GetCamera(Usd.TimeCode.Default()).frustum
-    to_world = UsdGeom.XformCache().GetLocalToWorldTransform(card.GetPrim())
-    to_clip = np.array(to_world * frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())
+    shown, _ = pixels_of_vertices(usd_stage, "Camera", (1, 1), "Card")
+    s, t = np.array(UsdGeom.PrimvarsAPI(card).GetPrimvar("st").Get()).T
+    np.testing.assert_allclose(shown, np.column_stack([s, 1 - t]), atol=1e-5)  # float32 apertures
     points = np.array(card.GetPointsAttr().Get(), dtype=np.float64)
-    clip = np.column_stack([points, np.ones(len(points))]) @ to_clip
-    shown = (clip[:, :2] / clip[:, 3:] + 1) / 2
-    np.testing.assert_allclose(shown, np.array(UsdGeom.PrimvarsAPI(card).GetPrimvar("st").Get()), atol=1e-5)  # float32 apertures
     a, b, c = (points[index] for index in list(card.GetFaceVertexIndicesAttr().Get())[:3])
     assert np.cross(b - a, c - b)[2] > 0  # towards the camera
 

@@ -228,10 +228,10 @@ def test_the_layer_of_lights_is_a_library_that_mixers_read(suffix, tmp_path):
         assert light.GetPrim().GetAttribute("inputs:karma:light:lpetag").Get() == path.name
 
 
-def pixels_of_vertices(usd_stage, name, resolution):
+def pixels_of_vertices(usd_stage, name, resolution, mesh="Mesh"):
     """Where OpenUSD's frustum of a camera shows the vertices, [n, 2] pixels, and their depths between its planes, -1…1."""
     frustum = UsdGeom.Camera(usd_stage.GetPrimAtPath(f"/A/{name}")).GetCamera(Usd.TimeCode.Default()).frustum
-    usd_mesh = UsdGeom.Mesh(usd_stage.GetPrimAtPath("/A/Geom/Mesh"))
+    usd_mesh = UsdGeom.Mesh(usd_stage.GetPrimAtPath(f"/A/Geom/{mesh}"))
     to_world = UsdGeom.XformCache().GetLocalToWorldTransform(usd_mesh.GetPrim())
     to_clip = np.array(to_world * frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())  # row vectors
     points = np.array(usd_mesh.GetPointsAttr().Get(), dtype=np.float64)
