@@ -14,20 +14,12 @@ from service.drive.judgement import XYZ
 from service.requests.drive import DriveRequest
 from stage.colour.colour import rgb_matrix
 from stage.transforms import fibonacci_sphere
-from tests.scenes.rigs import NORMALS, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
+from tests.scenes.rigs import NORMALS, irradiance, lamps_irradiance, read_levels, rms, sampled, write_rig, write_sky
 
 SKIES = ("sun", "overcast", "patches")
 ROWS = 128
 FULL = 4.0
 """Irradiance of every primary at full level."""
-
-
-def sampled(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the energies of lamps [lights, 3] that are set to the pixels of an 8-bit panorama in their directions."""
-    x, y, z = directions.T
-    rows, columns = radiance.shape[:2]
-    row, column = (np.arccos(y) / np.pi * rows).astype(int), (np.arctan2(x, -z) / (2 * np.pi) % 1 * columns).astype(int)
-    return np.round(np.clip(radiance, 0, 1)[row, column] * 255) / 255 * 4 * np.pi / len(directions)
 
 
 def chromaticity_rms(given: np.ndarray, wanted: np.ndarray, space: str) -> float:

@@ -26,6 +26,7 @@ from stage.capture.capture import Capture
 from stage.importers import diligent
 from stage.results.maps import MAPS_FILE
 from stage.stack.correction import Correction
+from tests.reference.colour import srgb
 
 EVERY = 8
 """Every light with an index that this number divides is left out: 12 of 96."""
@@ -141,12 +142,6 @@ def left_out_scores(left: LeftOut, *, rti: bool) -> dict[str, Scores]:
         for name, matrix in rti_fits(left.captured, left.wanted, some).items():
             scores[name] = Scores(float("nan"), psnr(np.clip(matrix @ shown, 0, 1).reshape(left.truth.shape)))
     return scores
-
-
-def srgb(linear: np.ndarray) -> np.ndarray:
-    """Return the sRGB curve of values limited to 0…1 (IEC 61966-2-1)."""
-    value = np.clip(linear, 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def left_out_table(data: Path) -> list[str]:

@@ -5,6 +5,7 @@ camera counts. Speed is that of a pair of one megapixel with 128 disparities, fr
 """
 
 import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -19,7 +20,8 @@ from service.depth.stereo.stereo_pair import Disparity, match
 from stage.capture.camera import Camera, OtherCamera
 from tests.scenes import stereo as scenes
 from tests.scenes.depth import entry_of
-from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
+from tests.scenes.projected import Ball, Shape, Wall, rectangle
+from tests.scenes.stereo import CAMERA, OTHER, POSE
 
 NOISE = NoiseModel(0.003, 1e-4)
 RANGE_PX = 96
@@ -27,11 +29,11 @@ RANGE_PX = 96
 LARGE, LARGE_RANGE = (800, 1280), 128
 """Rows and columns of the pair whose matching is timed, and its disparities."""
 SCENES = {
-    "tilted plane": [Plane((0.02, 0.0, -1.1), (-0.35, 0.2, 1.0), 0.7)],
-    "sphere before a plane": [Plane((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Sphere((-0.06, 0.05, -0.88), 0.1, 0.55)],
-    "parts before each other": [Plane((0, 0, -1.3), (0.1, 0.05, 1)), Rectangle((-0.16, 0.02), (-0.12, 0.1), 0.9),
-                                Rectangle((0.1, 0.2), (-0.3, 0.05), 1.1), Rectangle((-0.25, -0.2), (-0.1, 0.1), 1.0, 0.01)],
-    "bars of 2, 7 and 19 pixels": [Plane((0, 0, -1.15), (0.05, 0.1, 1)), *(Rectangle(x, (-0.3, 0.3), depth) for x, depth in (
+    "tilted plane": [Wall((0.02, 0.0, -1.1), (-0.35, 0.2, 1.0), 0.7)],
+    "sphere before a plane": [Wall((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Ball((-0.06, 0.05, -0.88), 0.1, 0.55)],
+    "parts before each other": [Wall((0, 0, -1.3), (0.1, 0.05, 1), 0.6), rectangle((-0.16, 0.02), (-0.12, 0.1), 0.9),
+                                rectangle((0.1, 0.2), (-0.3, 0.05), 1.1), rectangle((-0.25, -0.2), (-0.1, 0.1), 1.0, 0.01)],
+    "bars of 2, 7 and 19 pixels": [Wall((0, 0, -1.15), (0.05, 0.1, 1), 0.6), *(rectangle(x, (-0.3, 0.3), depth) for x, depth in (
         ((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9)))],
 }
 
@@ -51,7 +53,7 @@ class Share(NamedTuple):
     """Parts of the right pixels whose error is within σ and 2σ; NaN without a σ."""
 
 
-def pair_of(parts: list[scenes.Part], textures: int) -> tuple[RectifiedFrames, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def pair_of(parts: Sequence[Shape], textures: int) -> tuple[RectifiedFrames, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return rectified frames, and for every pixel of the camera its row and column there, its true disparity, and whether both see it."""
     patterns = [scenes.dots(300 + index) for index in range(textures)]
     left, right = scenes.render(parts, patterns), scenes.render(parts, patterns, OTHER, POSE)

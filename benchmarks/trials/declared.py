@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.trials.lights import trial, write_grey
 from benchmarks.trials.trial import Trial
 from service.requests.solve import LightsKnown, Method
+from tests.reference.colour import linear_to_srgb
 
 SIZE = 96
 NOISE = 0.003
@@ -154,7 +155,7 @@ def write(folder: Path, case: Case, number: int) -> Surface:
 
 def dimmed_where_bright(light: np.ndarray) -> np.ndarray:
     """Return [rows, cols] light from 0 to 1 as codes of eight bits from 0 to 1, dimmed by the mean code around each pixel."""
-    codes = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    codes = linear_to_srgb(light)
     return np.rint(255 * np.clip(0.7 * codes / (0.3 + 1.4 * gaussian_filter(codes, SIZE / 8)), 0, 1)) / 255
 
 

@@ -20,6 +20,7 @@ from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.solve.solve import SolveResult, solve
 from stage.formats import exr
 from stage.importers import diligent
+from tests.reference.colour import linear_to_srgb
 
 SIZE, LIGHTS, STEPS = 96, 20, 64
 NOISE = 0.004
@@ -183,8 +184,7 @@ def trials(data: Path | None) -> Iterator[Trial]:
         yield trial("ring, linear declared sRGB", folder, normal, mask, in_model=False)[0]
         (folder / "capture.json").write_text(json.dumps(manifest))
         for number, image in enumerate(images):
-            seen = np.where(image < 0.0031308, 12.92 * image, 1.055 * np.maximum(image, 1e-9) ** (1 / 2.4) - 0.055)
-            write_grey(folder / f"{number:02d}.exr", seen)
+            write_grey(folder / f"{number:02d}.exr", linear_to_srgb(image))
         yield trial("ring, sRGB declared linear", folder, normal, mask, in_model=False)[0]
     if data is None:
         return

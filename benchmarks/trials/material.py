@@ -18,6 +18,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.formats import exr
 from stage.importers import diligent
+from tests.reference.sampling import lattice
 
 SIDE, PATHS, BOUNCES = 72, 64, 4
 LIGHTS, WIDEST_DEGREES, FRONTAL_DEGREES = 64, 75.0, 43.0
@@ -65,14 +66,6 @@ class Body(NamedTuple):
     images: np.ndarray  # [lights, rows, cols, 3] radiance under irradiance π
     normal: np.ndarray  # [rows, cols, 3]
     mask: np.ndarray  # [rows, cols] bool
-
-
-def cap(count: int) -> np.ndarray:
-    """Return [count, 3] directions, evenly within WIDEST_DEGREES of +z."""
-    step = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(WIDEST_DEGREES))) * step / count
-    turn, ring = np.pi * (1 + 5**0.5) * step, np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 def spread(directions: np.ndarray, count: int, widest_degrees: float) -> np.ndarray:
@@ -190,7 +183,7 @@ def trials(data: Path | None) -> Iterator[Trial]:
     except ImportError:
         print("material: Mitsuba is missing, its scenes are left out: pip install 'relit[samples]'")
     else:
-        directions = cap(LIGHTS)
+        directions = lattice(LIGHTS, WIDEST_DEGREES)
         bodies: dict[str, Body] = {}
         for case in CASES:
             key = json.dumps([case.bsdf, case.ball])

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.projected_scenes import Ball, Light, Wall, World, trace, write_capture
 from benchmarks.trials.trial import Trial
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
@@ -18,6 +17,7 @@ from stage.patterns.kary import kary_patterns, palette
 from stage.patterns.modulated import modulated_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.patterns.ramp import ramp_patterns
+from tests.scenes.projected import Ball, Light, Wall, World, trace, write_capture
 
 WIDTH, HEIGHT, NARROW = 320, 240, 256
 SHELF = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.05, -1.15), 0.12, 0.8, texture=0.3),

@@ -16,7 +16,8 @@ from service.requests.depth import DepthRequest
 from stage.errors import StageError
 from stage.results.depth_maps import DepthMaps
 from tests.scenes import stereo as scenes
-from tests.scenes.stereo import OTHER, POSE, Part, Plane, Rectangle, Sphere
+from tests.scenes.projected import Ball, Shape, Wall, rectangle
+from tests.scenes.stereo import OTHER, POSE
 
 SCENES = 3
 """Random scenes whose pixels a row counts together."""
@@ -49,17 +50,17 @@ def _turned(x: float, y: float, z: float) -> Change:
     return lambda camera: {**camera, "camera_from_other": pose.tolist()}
 
 
-def _scene(random: np.random.Generator) -> list[Part]:
+def _scene(random: np.random.Generator) -> list[Shape]:
     """Return a wall, and up to four parts before it."""
-    parts: list[Part] = [Plane((0, 0, -random.uniform(1.1, 1.5)), (random.uniform(-0.4, 0.4), random.uniform(-0.4, 0.4), 1))]
+    parts: list[Shape] = [Wall((0, 0, -random.uniform(1.1, 1.5)), (random.uniform(-0.4, 0.4), random.uniform(-0.4, 0.4), 1), 0.6)]
     for _ in range(random.integers(1, 5)):
         at, far = random.uniform((-0.22, -0.16), (0.2, 0.15)), random.uniform(0.75, 1.05)
         albedo = random.uniform(0.2, 0.9)
         if random.random() < 0.5:
-            parts.append(Sphere((*at, -far), random.uniform(0.03, 0.13), albedo))
+            parts.append(Ball((*at, -far), random.uniform(0.03, 0.13), albedo))
         else:
             wide, high = random.uniform((0.01, 0.02), (0.15, 0.2))
-            parts.append(Rectangle((at[0], at[0] + wide), (at[1], at[1] + high), far, albedo))
+            parts.append(rectangle((at[0], at[0] + wide), (at[1], at[1] + high), far, albedo))
     return parts
 
 

@@ -16,6 +16,13 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
+def print_lines(**values: object) -> None:
+    """Print a line for each value that is there, behind its name."""
+    for name, value in values.items():
+        if value is not None:
+            print(f"{name:<8} {value}")
+
+
 def print_warnings(warnings: Sequence[str]) -> None:
     """Print a line for each thing that does not fit."""
     for sentence in warnings:

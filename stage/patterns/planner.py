@@ -65,11 +65,8 @@ RATIO_COUNT = 2
 """Images of the intensity ratio."""
 PHASE_COUNT = 3
 """Images of phase shifting over one period."""
-
-
-def stripe_sigma(stripe_px: float) -> float:
-    """Return the standard deviation of a place somewhere in a stripe, projector pixels."""
-    return stripe_px / float(np.sqrt(12))
+STRIPE_SIGMA = 12**-0.5
+"""Standard deviation of a place somewhere in a stripe that is one projector pixel wide, projector pixels."""
 
 
 def phase_sigma(periods_px: tuple[float, ...], steps: int, noise: float) -> float:

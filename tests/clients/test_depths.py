@@ -10,6 +10,7 @@ from stage.capture.camera import Camera
 from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from tests.clients.programs import require
+from tests.reference.colour import srgb_to_linear
 
 pytestmark = pytest.mark.long
 
@@ -30,8 +31,7 @@ def test_a_depth_looks_like_its_photograph(client, suffix, programs, tmp_path):
     found = export(ExportRequest(maps=tmp_path, out=tmp_path / f"wall{suffix}", name="Wall"))
     assert not any("grey" in sentence for sentence in found.warnings)
     picture = programs.render(client, found.path, CAMERA, WHITE, samples=64)
-    level = CODES / 255
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    linear = srgb_to_linear(CODES / 255)
     inner = mask & (picture[..., 3] > 0.999)
     assert inner.sum() > 0.9 * mask.sum()
     ratio = picture[inner][:, :3] / linear[inner]

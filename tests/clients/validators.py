@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from zipfile import ZipFile
 
 import MaterialX
-import usd_validation_nvidia
+import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
 ARKIT_FILES = {".usdc", ".png", ".jpg", ".jpeg"}
@@ -23,6 +23,7 @@ def findings(path: Path) -> list[str]:
 
     MaterialX documents are those beside the layer.
     """
+    usd_validation_nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
     issues = usd_validation_nvidia.ValidationEngine().validate(str(path)).issues()
     found = [f"NVIDIA: {issue.severity.name} {issue.message}" for issue in issues]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()

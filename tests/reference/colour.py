@@ -11,6 +11,16 @@ def srgb_to_linear(encoded):
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(linear):
+    """The inverse: negative values stay on the straight part, those above 1 on the curve."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def srgb(linear):
+    """Display values of linear ones, clipped at black and white."""
+    return linear_to_srgb(np.clip(linear, 0, 1))
+
+
 AWG4_TO_ACES = np.array([[0.750957362824734, 0.144422786709757, 0.104619850465509],
                          [0.000821837079380, 1.007397584885003, -0.008219421964384],
                          [-0.000499952143533, -0.000854177231437, 1.001354129374970]])

@@ -45,12 +45,6 @@ def harmonics(directions, terms):
     return np.array(rows)
 
 
-def srgb(linear):
-    """Display values of linear ones, clipped at black and white."""
-    value = np.clip(linear, 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-
-
 def render_ptm(data, directions):
     """[light, rows, cols, 3] values 0…1 that a viewer shows of the bytes of a .ptm file; row 0 on top."""
     version, name, width, height, scales, biases, body = data.split(b"\n", 6)

@@ -71,20 +71,32 @@ def delaunay_triangles(directions):
     return triples[(above <= 0).all(axis=1) | (above >= 0).all(axis=1)]
 
 
-def smooth_energy(environment, directions, rotation, *, down, across):
-    """Energy [light, 3] and ∫ share dω [light] where each sample is the positive combination of a Delaunay triangle's corners, and is
-    shared by them as its coefficients are, scaled to sum one. The lights lie all around: the centre is inside their hull."""
-    triangles = delaunay_triangles(directions)
-    inverse = np.linalg.inv(directions[triangles].swapaxes(1, 2))
-    energy, solid_angle = np.zeros((len(directions), 3)), np.zeros(len(directions))
-    for turned, weight, radiance in samples(environment, rotation, down=down, across=across):
-        coefficients = np.einsum("fkx,nx->nfk", inverse, turned)
+def shares_among(lights):
+    """A function of unit directions [n, 3]: [n, lights], the coefficients of the Delaunay triangle whose positive combination a direction
+    is, scaled to sum one. The lights lie all around: the centre is inside their hull."""
+    triangles = delaunay_triangles(lights)
+    inverse = np.linalg.inv(lights[triangles].swapaxes(1, 2))
+
+    def shares(direction):
+        coefficients = np.einsum("fkx,nx->nfk", inverse, direction)
         face = np.argmax(coefficients.min(axis=2), axis=1)
         share = np.take_along_axis(coefficients, face[:, None, None], axis=1)[:, 0]
         assert share.min() > -1e-12
-        share *= (weight / share.sum(axis=1))[:, None]
-        np.add.at(solid_angle, triangles[face], share)
-        np.add.at(energy, triangles[face], share[..., None] * radiance[:, None])
+        whole = np.zeros((len(direction), len(lights)))
+        np.put_along_axis(whole, triangles[face], share / share.sum(axis=1, keepdims=True), axis=1)
+        return whole
+
+    return shares
+
+
+def smooth_energy(environment, directions, rotation, *, down, across):
+    """Energy [light, 3] and ∫ share dω [light] where each sample is shared among the lights around it."""
+    shares = shares_among(directions)
+    energy, solid_angle = np.zeros((len(directions), 3)), np.zeros(len(directions))
+    for turned, weight, radiance in samples(environment, rotation, down=down, across=across):
+        share = shares(turned) * weight[:, None]
+        solid_angle += share.sum(axis=0)
+        energy += share.T @ radiance
     return energy, solid_angle
 
 

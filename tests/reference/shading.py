@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.reference.microfacet import diffuse, specular
-from tests.reference.relight import delaunay_triangles
+from tests.reference.relight import shares_among
 
 
 class Pixels(NamedTuple):
@@ -107,26 +107,14 @@ def trust(images, model, neighbours, shares):
     return np.clip((missing * told).sum(axis=(0, 1)) / (told**2).sum(axis=(0, 1)), 0, 1), missing, told
 
 
-def shares_around(lights, direction):
-    """[P, lights]: of unit directions [P, 3], the coefficients of the Delaunay triangle that a direction is a positive combination of,
-    scaled to sum one; lights all around."""
-    triangles = delaunay_triangles(lights)
-    coefficients = np.einsum("fkx,nx->nfk", np.linalg.inv(lights[triangles].swapaxes(1, 2)), direction)
-    face = np.argmax(coefficients.min(axis=2), axis=1)
-    share = np.maximum(np.take_along_axis(coefficients, face[:, None, None], axis=1)[:, 0], 0)
-    whole = np.zeros((len(direction), len(lights)))
-    np.put_along_axis(whole, triangles[face], share / share.sum(axis=1, keepdims=True), axis=1)
-    return whole
-
-
 def sum_near(images, pixels, sources, lights):
     """[3, P] of images [lights, 3, P] of readings, each pixel's weighted by its own shares of what arrives; and those weights,
     [lights, 3, P]."""
     position = np.asarray(pixels.position, dtype=np.float64)
-    weights = np.zeros(images.shape)
+    weights, shares = np.zeros(images.shape), shares_among(lights)
     for place, energy, axis in zip(*(np.asarray(plane, dtype=np.float64) for plane in sources[:3]), strict=True):
         direction, strength = arrival(position, place, axis)
-        weights += np.einsum("pl,p,c->lcp", shares_around(lights, direction), strength, energy)
+        weights += np.einsum("pl,p,c->lcp", shares(direction), strength, energy)
     return (weights * images).sum(axis=0), weights
 
 

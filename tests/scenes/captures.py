@@ -174,8 +174,9 @@ def write_capture(folder: Path, scene: Scene | None = None, *, dtype: type[np.fl
 
 
 def edit_manifest(folder: Path, **changes: Any) -> None:
-    """Set keys of a written capture.json; None takes a key away."""
-    data = {**json.loads((folder / "capture.json").read_text()), **changes}
+    """Set keys of a written capture.json; a function is given what is there, and None takes a key away."""
+    data = json.loads((folder / "capture.json").read_text())
+    data |= {key: value(data[key]) if callable(value) else value for key, value in changes.items()}
     write_manifest(folder, {key: value for key, value in data.items() if value is not None})
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.transforms import fibonacci_sphere
 from tests.reference import microfacet
 from tests.scenes import captures
 
@@ -58,10 +59,7 @@ def reflect(normal: np.ndarray, toward: np.ndarray, roughness: float = ROUGHNESS
 
 def sphere_directions(count: int) -> np.ndarray:
     """[count, 3] unit directions, evenly over the sphere."""
-    y = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.pi * (1 + 5**0.5) * np.arange(count)
-    ring = np.sqrt(1 - y**2)
-    return np.stack([ring * np.sin(turn), y, ring * np.cos(turn)], axis=-1)
+    return fibonacci_sphere(count)[:, [1, 2, 0]]
 
 
 def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: float = 2.0, directions: np.ndarray | None = None,

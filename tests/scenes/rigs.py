@@ -83,6 +83,14 @@ def read_levels(folder: Path) -> list[dict]:
     return list(frames.values())
 
 
+def sampled(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the energies of lamps [lights, 3] that are set to the pixels of an 8-bit panorama in their directions."""
+    x, y, z = directions.T
+    rows, columns = radiance.shape[:2]
+    row, column = (np.arccos(y) / np.pi * rows).astype(int), (np.arctan2(x, -z) / (2 * np.pi) % 1 * columns).astype(int)
+    return np.round(np.clip(radiance, 0, 1)[row, column] * 255) / 255 * 4 * np.pi / len(directions)
+
+
 def rms(ours, truth) -> float:
     """Return the root mean square of ours − truth over that of the truth."""
     return float(np.sqrt(((ours - truth) ** 2).mean() / (truth**2).mean()))

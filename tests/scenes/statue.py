@@ -78,13 +78,14 @@ def place(angle: float, height: float, range_m: float, *, target: tuple[float, f
     return look_at(eye, target)
 
 
-def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float = SIGMA, seed: int = 0, scene=distance) -> Shot:
-    """A range image by sphere tracing, with Gaussian noise on the depth."""
+def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float = SIGMA, seed: int = 0, scene=distance,
+          **march: float) -> Shot:
+    """A range image by sphere tracing, with Gaussian noise on the depth; `march`: options of `trace`."""
     rows, cols = side
     u, v = np.meshgrid(np.arange(cols) + 0.5 - cols / 2, np.arange(rows) + 0.5 - rows / 2)
     ray = np.stack([u / focal, -v / focal, -np.ones(side)], axis=-1).reshape(-1, 3)
     length = np.linalg.norm(ray, axis=-1)
-    along, hit = trace(pose[:3, 3], (ray / length[:, None]) @ pose[:3, :3].T, scene)
+    along, hit = trace(pose[:3, 3], (ray / length[:, None]) @ pose[:3, :3].T, scene, **march)
     true = np.where(hit, along / length, 0).reshape(side)
     noise = sigma * np.random.default_rng(seed).standard_normal(side)
     mask = hit.reshape(side)

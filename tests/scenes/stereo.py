@@ -1,9 +1,10 @@
-"""Pairs of views under projected texture with a known depth: planes, spheres and rectangles traced in closed form in float64.
+"""Pairs of views under projected texture with a known depth: planes, spheres and rectangles traced in float64.
 
 Every pixel is the mean over a grid of places within it, so that edges are mixed as a camera mixes them. The texture comes from a projector
 of its own: what another part keeps from its light is dark. Nothing here imports the code that it judges.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 from tests.reference import projector as reference
 from tests.scenes.captures import write_image, write_manifest
 from tests.scenes.depth import entry_of
+from tests.scenes.projected import FAR_M, Shape, meet
 
 CAMERA = reference.Device(320, 240, 420.0, (-0.08, 0.02, 0.0), (0.0006, -0.0004))
 OTHER = reference.Device(320, 240, 424.0, (-0.06, 0.01, 0.0), (-0.0005, 0.0003))
@@ -21,53 +23,6 @@ PROJECTOR_POSE = reference.look_at((0.05, 0.06, 0.0), (0.02, 0.0, -1.0))
 SIDE = 4
 """Places within a pixel, along each side."""
 AMBIENT = 0.03
-
-
-class Plane(NamedTuple):
-    """An endless plane."""
-
-    point: tuple[float, float, float]
-    normal: tuple[float, float, float]
-    albedo: float = 0.6
-
-    def hit(self, origin, rays):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (np.array(self.point) - origin) @ np.array(self.normal, float) / (rays @ np.array(self.normal, float))
-        return np.where(t > 1e-9, t, np.inf)
-
-
-class Sphere(NamedTuple):
-    """A sphere."""
-
-    centre: tuple[float, float, float]
-    radius: float
-    albedo: float = 0.6
-
-    def hit(self, origin, rays):
-        off = np.array(self.centre) - origin
-        a, b = (rays**2).sum(axis=-1), rays @ off
-        root = b**2 - a * (off @ off - self.radius**2)
-        t = (b - np.sqrt(np.maximum(root, 0))) / a
-        return np.where((root > 0) & (t > 1e-9), t, np.inf)
-
-
-class Rectangle(NamedTuple):
-    """A rectangle that faces the camera: x and y from, to, at a depth."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    depth: float
-    albedo: float = 0.6
-
-    def hit(self, origin, rays):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-self.depth - origin[2]) / rays[..., 2]
-        at = origin + np.where(np.isfinite(t), t, 0)[..., None] * rays
-        inside = (at[..., 0] >= self.x[0]) & (at[..., 0] <= self.x[1]) & (at[..., 1] >= self.y[0]) & (at[..., 1] <= self.y[1])
-        return np.where(inside & (t > 1e-9), t, np.inf)
-
-
-Part = Plane | Sphere | Rectangle
 
 
 class View(NamedTuple):
@@ -93,55 +48,53 @@ def grid_of_dots(period: int = 8) -> np.ndarray:
     return ((rows % period < period // 2) & (cols % period < period // 2)).astype(float)
 
 
-def first(parts, origin, rays):
-    """[...] distance along each ray to the first part, and its index."""
-    distances = np.stack([part.hit(origin, rays) for part in parts])
-    nearest = distances.argmin(axis=0)
-    return np.take_along_axis(distances, nearest[None], axis=0)[0], nearest
-
-
-def render(parts: list[Part], textures: list[np.ndarray], camera: reference.Device = CAMERA, pose: np.ndarray | None = None, *,
+def render(parts: Sequence[Shape], textures: list[np.ndarray], camera: reference.Device = CAMERA, pose: np.ndarray | None = None, *,
            side: int = SIDE) -> View:
     """What a camera at `pose` (camera_from_other; None: the reference) sees of the parts under each texture."""
     pose = np.eye(4) if pose is None else pose
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    origin, albedo = pose[:3, 3], np.array([part.albedo for part in parts])
     images = np.zeros((len(textures), camera.height, camera.width))
     for down in range(side):
         for across in range(side):
             uv = np.stack([u + (across + 0.5) / side, v + (down + 0.5) / side], axis=-1)
-            images += shade(parts, textures, origin, reference.rays(camera, uv) @ pose[:3, :3].T, albedo)
-    rays = reference.rays(camera, np.stack([u + 0.5, v + 0.5], axis=-1))
-    t, part = first(parts, origin, rays @ pose[:3, :3].T)
-    depth = np.where(np.isfinite(t), t, np.nan)
-    return View(images / side**2, depth, part, origin + depth[..., None] * (rays @ pose[:3, :3].T))
+            images += shade(parts, textures, pose[:3, 3], unit(reference.rays(camera, uv))[0] @ pose[:3, :3].T)
+    rays, length = unit(reference.rays(camera, np.stack([u + 0.5, v + 0.5], axis=-1)))
+    distance, _, _, part = meet(parts, pose[:3, 3], rays @ pose[:3, :3].T)
+    distance = np.where(distance < FAR_M, distance, np.nan)
+    return View(images / side**2, distance / length, part, pose[:3, 3] + distance[..., None] * (rays @ pose[:3, :3].T))
 
 
-def shade(parts, textures, origin, rays, albedo):
+def unit(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of ways [..., 3], and their lengths."""
+    length = np.linalg.norm(ways, axis=-1)
+    return ways / length[..., None], length
+
+
+def shade(parts, textures, origin, rays):
     """[patterns, rows, cols] radiance along rays."""
-    t, part = first(parts, origin, rays)
-    seen = np.isfinite(t)
-    points = origin + np.where(seen, t, 0)[..., None] * rays
-    away = points - PROJECTOR_POSE[:3, 3]
-    clear = first(parts, PROJECTOR_POSE[:3, 3], away)[0] > 1 - 1e-6
+    distance, _, albedo, _ = meet(parts, origin, rays)
+    seen = distance < FAR_M
+    points = origin + np.where(seen, distance, 0)[..., None] * rays
+    away, far = unit(points - PROJECTOR_POSE[:3, 3])
+    clear = meet(parts, PROJECTOR_POSE[:3, 3], away)[0] > (1 - 1e-6) * far
     at = reference.seen_by(PROJECTOR, PROJECTOR_POSE, points) - 0.5
     lit = seen & clear & (at >= 0).all(axis=-1) & (at[..., 0] < PROJECTOR.width - 1) & (at[..., 1] < PROJECTOR.height - 1)
     at = np.where(lit[..., None], at, 0)
     col, row = (np.floor(at[..., i]).astype(int) for i in (0, 1))
     right, down = at[..., 0] - col, at[..., 1] - row
-    fall = 0.5 / (away**2).sum(axis=-1)
+    fall = 0.5 / far**2
     found = []
     for texture in textures:  # interpolated: a projector's pixels are as wide as they are apart, and never sharper
         shown = ((1 - down) * ((1 - right) * texture[row, col] + right * texture[row, col + 1])
                  + down * ((1 - right) * texture[row + 1, col] + right * texture[row + 1, col + 1]))
-        found.append(np.where(seen, albedo[part] * (AMBIENT + np.where(lit, fall * shown, 0)), 0))
+        found.append(np.where(seen, albedo * (AMBIENT + np.where(lit, fall * shown, 0)), 0))
     return np.stack(found)
 
 
 def visible_to(parts, points, pose, camera=OTHER):
     """[rows, cols] bool: the camera at `pose` sees these points, and its image holds them."""
-    origin = pose[:3, 3]
-    clear = first(parts, origin, points - origin)[0] > 1 - 1e-4
+    away, far = unit(points - pose[:3, 3])
+    clear = meet(parts, pose[:3, 3], away)[0] > (1 - 1e-4) * far
     uv = reference.seen_by(camera, pose, points)
     return clear & (uv > 0).all(axis=-1) & (uv[..., 0] < camera.width) & (uv[..., 1] < camera.height)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.transforms import rotation_about_y
-from tests.scenes.statue import ball, box, capsule, trace
+from tests.scenes.statue import Shot, ball, box, capsule, shoot
 
 MM = 1e-3
 DISTANCE_M = 2.0
@@ -94,23 +94,17 @@ def pose(angle_deg: float, *, raise_m: float = 0.25) -> np.ndarray:
 
 def see(surface: Distance, world_from_scan: np.ndarray, *, rows: int, sigma: float, seed: int) -> View:
     """A range image with independent noise of the z-depth."""
-    depth, hit = _march(surface, tuple(map(tuple, world_from_scan)), rows)
-    rng = np.random.default_rng(seed)
-    noisy = depth + sigma * rng.standard_normal(depth.shape)
-    return View(camera_of(rows), np.where(hit, noisy, 0).astype(np.float32), hit, np.full(depth.shape, sigma, dtype=np.float32),
-                world_from_scan, depth)
+    shot = _true(surface, tuple(map(tuple, world_from_scan)), rows)
+    noisy = shot.true + sigma * np.random.default_rng(seed).standard_normal(shot.side)
+    return View(camera_of(rows), np.where(shot.mask, noisy, 0).astype(np.float32), shot.mask, np.full(shot.side, sigma, dtype=np.float32),
+                world_from_scan, shot.true)
 
 
 @cache
-def _march(surface: Distance, pose_rows: tuple, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    camera, world_from_scan = camera_of(rows), np.array(pose_rows)
-    x, y = camera.plane_coordinates()
-    ray = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
-    length = np.linalg.norm(ray, axis=1)
-    direction = (ray / length[:, None]) @ world_from_scan[:3, :3].T
-    along, hit = trace(world_from_scan[:3, 3], direction, surface, near=DISTANCE_M - 0.75, far=DISTANCE_M + 0.75, hit_m=HIT_M, steps=STEPS)
-    shape = camera.height, camera.width
-    return np.where(hit, along / length, 0).reshape(shape), hit.reshape(shape)
+def _true(surface: Distance, pose_rows: tuple, rows: int) -> Shot:
+    camera = camera_of(rows)
+    return shoot(np.array(pose_rows), (camera.height, camera.width), camera.focal_px[0], scene=surface, sigma=0.0,
+                 near=DISTANCE_M - 0.75, far=DISTANCE_M + 0.75, hit_m=HIT_M, steps=STEPS)
 
 
 def turntable(surface: Distance, angles: list[float], *, rows: int = 160, sigma: float = 0.25 * MM, seed: int = 1,

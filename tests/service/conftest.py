@@ -1,7 +1,9 @@
 """The program, run inside the test's process."""
 
+import json
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -9,6 +11,7 @@ from typer.main import get_command
 
 from service.cli.main import main, program
 from service.cli.progress import ProgressBar
+from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball
 from tests.service.postgres import binaries, postgres
@@ -32,6 +35,14 @@ class Outcome(NamedTuple):
         assert self.code == 2 and printed == bool(self.out) and self.err.startswith("relit: ") and self.err.count("\n") == 1, self
         assert words in self.err, self
         return self.err
+
+
+class Made(NamedTuple):
+    """What a solve or a depth has made and said."""
+
+    maps: Any  # SurfaceMaps or DepthMaps
+    report: dict[str, Any]
+    said: str
 
 
 @cache
@@ -67,6 +78,25 @@ class Program:
         outcome = self(*arguments)
         outcome.well()
         return outcome
+
+    def solve(self, capture: Path, *options: object, **more: Any) -> Made:
+        """Run `relit solve`; the other arguments are those of `depth`."""
+        return self._made("solve", capture, options, lambda out, unsure: SurfaceMaps.read(out / "maps.exr", unsure=unsure), **more)
+
+    def depth(self, capture: Path, *options: object, **more: Any) -> Made:
+        """Run `relit depth` and read its results.
+
+        `out`: where they are; None: in the folder `out` of the capture. `code`: how it is to end; None: well, whether or not a pixel is
+        sure. `unsure`: pixels that are not sure keep their values.
+        """
+        return self._made("depth", capture, options, lambda out, unsure: DepthMaps.read(out / "depth.exr", unsure=unsure), **more)
+
+    def _made(self, command: str, capture: Path, options: tuple[object, ...], read: Any, *, out: Path | None = None, code: int | None = 0,
+              unsure: bool = False) -> Made:
+        out = out or capture / "out"
+        outcome = self(command, capture, "--out", out, *options)
+        assert outcome.err == "" and outcome.code in ((0, 1) if code is None else (code,)), outcome
+        return Made(read(out, unsure), json.loads((out / "report.json").read_text()), outcome.out)
 
     def refused(self, *arguments: object) -> str:
         """Return the one sentence that refuses the user's input."""

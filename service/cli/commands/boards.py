@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from service.cli.printing import print_lines
 from service.cli.request_commands import product_command
 from service.requests.inspect_board import BoardCapabilityRequest, GaugeBoardRequest, InspectBoardRequest, InspectPasteRequest
 
@@ -27,9 +28,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _inspect_board(result: "InspectBoardResult") -> bool:
-    print(f"height   {result.board_path}")
-    print(f"picture  {result.picture_path}")
-    print(f"report   {result.report_path}")
+    print_lines(height=result.board_path, picture=result.picture_path, report=result.report_path)
     if result.findings_path is not None and result.verdict is not None and result.inspected is not None:
         print(f"findings {result.findings_path}")
         for defect in result.defects[:MOST_PRINTED]:
@@ -49,10 +48,7 @@ def _inspect_board(result: "InspectBoardResult") -> bool:
 
 
 def _inspect_paste(result: "InspectPasteResult") -> bool:
-    print(f"height   {result.board_path}")
-    print(f"picture  {result.picture_path}")
-    print(f"report   {result.report_path}")
-    print(f"pads     {result.pads_path}")
+    print_lines(height=result.board_path, picture=result.picture_path, report=result.report_path, pads=result.pads_path)
     wrong = [each for each in result.pads if each.verdict not in (None, "pass") or each.bridged]
     for each in wrong[:MOST_PRINTED]:
         said = ", ".join(f"{name.removesuffix('_percent').replace('_', ' ')} {value:.1f} ± {sigma:.1f} %" for name, (value, sigma) in
@@ -66,8 +62,7 @@ def _inspect_paste(result: "InspectPasteResult") -> bool:
 
 
 def _board_capability(result: "BoardCapabilityResult") -> None:
-    print(f"table    {result.table_path}")
-    print(f"report   {result.report_path}")
+    print_lines(table=result.table_path, report=result.report_path)
     for each in result.found[:MOST_PRINTED]:
         print(f"capable  {each.name} {each.quantity.replace('_', ' ')}: Cpk {each.cpk:.2f} (95 % sure: {each.cpk_bound:.2f}), "
               f"Cp {each.cp:.2f}, {each.boards} boards")
@@ -77,8 +72,7 @@ def _board_capability(result: "BoardCapabilityResult") -> None:
 
 def _gauge_board(result: "GaugeBoardResult") -> None:
     study = result.study
-    print(f"table    {result.table_path}")
-    print(f"report   {result.report_path}")
+    print_lines(table=result.table_path, report=result.report_path)
     print(f"repeat   {1e6 * study.repeatability:.4g} µm (95 % sure: below {1e6 * study.repeatability_bound:.4g}), "
           f"{study.degrees_of_freedom} degrees of freedom; the inspections state {1e6 * result.noise_m:.4g} µm")
     print("operator not measured: there is one" if study.reproducibility is None else f"operator {1e6 * study.reproducibility:.4g} µm")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import print_table
+from service.cli.printing import print_lines, print_table
 from service.cli.request_commands import product_command
 from service.requests import calibrate
 from service.requests.chart import ChartRequest
@@ -88,14 +88,12 @@ def _laser_planes(result: Any, request: calibrate.LaserPlanesRequest) -> None:
 
 
 def _response(result: Any) -> None:
-    print(f"capture  {result.manifest_path}")
-    print(f"report   {result.report_path}")
+    _print_files((result.manifest_path,), result.report_path)
     print(f"response nearest to level^{result.gamma:.2f}; pixels deviate by {100 * result.spread:.2g} % of full scale")
 
 
 def _tof(result: Any) -> None:
-    print(f"file     {result.path}")
-    print(f"report   {result.report_path}")
+    print_lines(file=result.path, report=result.report_path)
     drift = result.calibration.temperature
     found = [f"wiggling at {harmonics.modulation_hz / 1e6:g} MHz" for harmonics in result.calibration.harmonics]
     found += [f"scale {result.calibration.scale:.5g}", f"offset {1000 * result.calibration.offset_m:.2f} mm"]
@@ -107,12 +105,8 @@ def _tof(result: Any) -> None:
 
 
 def _rig(result: Any) -> None:
-    print(f"rig      {result.rig_path}")
-    print(f"report   {result.report_path}")
-    print(f"lamps    {result.summary}")
-    print_table([result.headings, *result.rows[:LIGHT_ROWS]])
-    if len(result.rows) > LIGHT_ROWS:
-        print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
+    print_lines(rig=result.rig_path, report=result.report_path, lamps=result.summary)
+    _print_least_sure(result)
 
 
 def _print_files(manifest_paths: Iterable[Path], report_path: Path) -> None:
@@ -125,6 +119,10 @@ def _print_lights(result: "LightCalibration") -> None:
     """Print where the results are, and the lights that are least sure."""
     _print_files((result.manifest_path,), result.report_path)
     print(f"lights   {result.summary}")
+    _print_least_sure(result)
+
+
+def _print_least_sure(result: Any) -> None:
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")

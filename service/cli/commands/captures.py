@@ -4,7 +4,7 @@ from typing import Any
 
 import typer
 
-from service.cli.printing import check_single, counted, print_sequence, print_warnings
+from service.cli.printing import check_single, counted, print_lines, print_sequence, print_warnings
 from service.cli.progress import ProgressOption, ProgressStyle, progress_in, with_bar
 from service.cli.request_commands import local_command, product_command
 from service.requests.captures import InfoRequest, ViewRequest
@@ -36,10 +36,7 @@ def _info(found: Any) -> None:
 
 
 def _view(result: Any) -> None:
-    print(f"view     {result.path}")
-    print(f"frames   {result.frames}")
-    if result.layers:
-        print(f"layers   {', '.join(result.layers)}")
+    print_lines(view=result.path, frames=result.frames, layers=", ".join(result.layers) or None)
     if result.levels is not None:
         mean, largest = result.levels
         print(f"relight  {result.terms} coefficient images: {mean:.2g} of 255 levels off under lights that they were not made from, "
@@ -59,9 +56,7 @@ def _solve(request: SolveRequest, progress: ProgressOption = ProgressStyle.BAR) 
 
     check_single(request)
     result = with_bar(solve, request, progress)
-    print(f"maps     {result.maps_path}")
-    print(f"report   {result.report_path}")
-    print(f"pixels   {counted(result.counts)}")
+    print_lines(maps=result.maps_path, report=result.report_path, pixels=counted(result.counts))
     print_warnings(result.warnings)
     if result.suspects:
         worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
@@ -83,14 +78,7 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
     if result.skipped:
         rest = "; the others are made" if result.skipped < len(result.frames) else ""
         print(f"skipped  {result.skipped} of {len(result.frames)} frames were there already, made by an equal run{rest}")
-    if request.display is not None:
-        print(f"display  {request.display}")
-    if request.sheet is not None:
-        print(f"sheet    {request.sheet}")
-    if request.nuke is not None:
-        print(f"nuke     {request.nuke}")
-    if request.report is not None:
-        print(f"report   {request.report}")
+    print_lines(display=request.display, sheet=request.sheet, nuke=request.nuke, report=request.report)
     if result.near_lights:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
     if result.matte:
@@ -105,9 +93,7 @@ def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) 
 
     with progress_in(progress) as bar:
         result = shade(request, bar)
-    print(f"picture  {result.path}")
-    if request.display is not None:
-        print(f"display  {request.display}")
+    print_lines(picture=result.path, display=request.display)
     if not result.metric and (request.light or request.sphere or request.rectangle):
         print("scale    the maps have none: places of lights are taken in pixels")
     if result.clipped:

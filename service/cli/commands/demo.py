@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli.printing import print_lines
 from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import local_command, product_command
 from service.requests.demo import BenchRequest, DemoRequest, sample_folder
@@ -31,11 +32,8 @@ def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
     from service.demo.demo import demo
 
     result = with_bar(demo, request)
-    print(f"maps     {result.solved.maps_path}")
-    print(f"report   {result.solved.report_path}")
-    print(f"asset    {result.asset}")
-    print(f"frames   {result.frames[0]} … {result.frames[-1].name}")
-    print(f"picture  {result.preview}")
+    print_lines(maps=result.solved.maps_path, report=result.solved.report_path, asset=result.asset,
+                frames=f"{result.frames[0]} … {result.frames[-1].name}", picture=result.preview)
     if serve:
         open_service(request.out / SERVICE, request.device, result)
 

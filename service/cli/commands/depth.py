@@ -5,8 +5,8 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import check_single, counted, print_sequence, print_warnings
-from service.cli.progress import ProgressBar, with_bar
+from service.cli.printing import check_single, counted, print_lines, print_sequence, print_warnings
+from service.cli.progress import with_bar
 from service.cli.request_commands import Given, local_command, product_command
 from service.errors import RequestError
 from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest, SimulateCwRequest, SimulatePulsedRequest
@@ -41,13 +41,10 @@ def _depth(request: DepthRequest) -> None:
     result = with_bar(depth, request)
     if result.points_path is None:
         print(f"decoded  {result.depth_path} (projector coordinates, no depth)")
-        print(f"report   {result.report_path}")
-        print(f"method   {result.method}")
+        print_lines(report=result.report_path, method=result.method)
     else:
-        print(f"depth    {result.depth_path}")
-        print(f"points   {result.points_path}")
-        print(f"report   {result.report_path}")
-        print(f"method   {result.method}, {result.points} points")
+        print_lines(depth=result.depth_path, points=result.points_path, report=result.report_path,
+                    method=f"{result.method}, {result.points} points")
     print(f"pixels   {counted(result.counts)}")
     print_warnings(result.warnings)
     if not result.counts.get("ok"):
@@ -55,19 +52,14 @@ def _depth(request: DepthRequest) -> None:
 
 
 def _separate(result: Any) -> None:
-    print(f"parts    {result.separation_path}")
-    print(f"report   {result.report_path}")
+    print_lines(parts=result.separation_path, report=result.report_path)
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
     print(f"pixels   {counted(result.counts)}")
 
 
 def _scan(result: Any) -> None:
-    print(f"points   {result.points_path}")
-    print(f"usd      {result.usd_path}")
-    if result.las_path is not None:
-        print(f"las      {result.las_path}")
-    print(f"report   {result.report_path}")
-    print(f"shots    {counted(result.counts)}")
+    print_lines(points=result.points_path, usd=result.usd_path, las=result.las_path, report=result.report_path,
+                shots=counted(result.counts))
 
 
 def _patterns(drawn: Given[PatternsRequest], planned: Given[PlanRequest], plan: PlanOption = False) -> None:
@@ -106,7 +98,6 @@ def _write(drawn: Given[PatternsRequest], plan: bool) -> None:
         code = drawn.values["code"]
         drawn.values = {name: value for name, value in drawn.values.items()
                         if name not in CodeOptions.model_fields or code in CODES_OF_OPTION.get(name, (code,))}
-    with ProgressBar() as bar:
-        result = make_patterns(drawn.build(), bar)
+    result = with_bar(make_patterns, drawn.build())
     print(f"images   {result.images[0]} … {result.images[-1].name}")
     print(f"entries  {result.fragment}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from service.cli.printing import print_warnings
+from service.cli.printing import print_lines, print_warnings
 from service.cli.progress import ProgressOption, ProgressStyle, with_bar
 from service.cli.request_commands import local_command, product_command
 from service.requests.basis import BasisRequest
@@ -107,15 +107,13 @@ def _publish(result: Any, request: PublishRequest) -> None:
 
 def _join(result: Any) -> None:
     pixels, sigma = result.facts["pixels"], result.facts["sigma_m"]
-    print(f"maps     {result.maps_path}")
-    print(f"report   {result.report_path}")
+    print_lines(maps=result.maps_path, report=result.report_path)
     print(f"pixels   {pixels['solved']} solved of {pixels['mask']}, {pixels['with_depth']} with a depth")
     print(f"sigma    {sigma['joined_median'] * 1000:.3g} mm, of the depth alone {sigma['depth_median'] * 1000:.3g} mm")
 
 
 def _basis(result: Any) -> None:
-    print(f"basis    {result.path}")
-    print(f"facts    {result.facts_path}")
+    print_lines(basis=result.path, facts=result.facts_path)
     shown = "" if result.levels_rms is None else f" of what is shown, {result.levels_rms:.1f} of 255"
     print(f"error    {100 * result.relative_rms:.3g} % RMS{shown}: {result.terms} coefficients a channel, {result.lights} lights, "
           f"{result.pixels} pixels")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.groups import make_group
+from service.cli.printing import print_lines
 from service.cli.request_commands import Given, command
 from service.requests.base.base import Role
 from service.requests.relight import CHUNK_FRAMES, RelightRequest
@@ -63,8 +64,7 @@ def _write(made: "Job", where: Path) -> None:
     from service.farm.jobs import write_job
 
     written = write_job(made, where)
-    print(f"template {written.template}")
-    print(f"values   {written.values}")
+    print_lines(template=written.template, values=written.values)
     if written.is_bundle:
         print(f"submit   deadline bundle submit {shlex.quote(str(where))}")
     else:

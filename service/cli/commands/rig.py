@@ -5,8 +5,8 @@ from typing import Any
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.printing import print_lines, print_warnings
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command, product_command
 from service.requests import rig as requests
 from service.requests.drive import DriveRequest
@@ -30,10 +30,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _drive(result: Any) -> None:
-    print(f"cues     {result.cues}")
-    print(f"picture  {result.picture}")
-    print(f"report   {result.report}")
-    print(f"exposure {result.exposure:.4g}")
+    print_lines(cues=result.cues, picture=result.picture, report=result.report, exposure=f"{result.exposure:.4g}")
     print(f"error    irradiance {100 * result.judgement.rms.max():.2g} % RMS, chromaticity {result.judgement.chromaticity.max():.2g} u'v', "
           f"the largest of {result.frames} frames")
 
@@ -47,8 +44,7 @@ def _check(request: requests.RigCheckRequest) -> None:
     print(f"lamps    {', '.join(f'{count} with {name}' for name, count in found.primaries.items())}")
     for universe, channels in found.universes.items():
         print(f"universe {universe.protocol} {universe.number}: {channels} channels" + (f", to {universe.host}" if universe.host else ""))
-    if request.picture is not None:
-        print(f"picture  {request.picture}")
+    print_lines(picture=request.picture)
     print_warnings(found.warnings)
     if found.faults:
         raise RequestError("; ".join(f"{request.rig}: {fault}" for fault in found.faults))
@@ -64,8 +60,7 @@ def _sweep(made: Any) -> None:
 
 
 def _plan(found: Any, request: requests.RigPlanRequest) -> None:
-    print(f"table    {request.out / 'plan.csv'}")
-    print(f"plot     {request.out / 'plan.png'}")
+    print_lines(table=request.out / "plan.csv", plot=request.out / "plan.png")
     rows, doubts = found
     for row in rows:
         highlights = ", ".join(f"{100 * error:.2g}" for error in row.highlights)
@@ -89,16 +84,13 @@ def _play(request: PlayRequest) -> None:
 def _twin(request: TwinRequest) -> None:
     from service.twin.twin import open_twin, rehearse
 
-    with ProgressBar() as bar:
-        twin = open_twin(request, bar)
+    twin = with_bar(open_twin, request)
     print_warnings(twin.picture.warnings)
     result = rehearse(twin, request, lambda page: _listening(request.interface, page))
     print(f"frames   {result.frames} received")
     if result.out_of_order:
         print(f"packets  {result.out_of_order} came out of order and were left out")
-    for name, path in (("picture", request.snapshot), ("levels", request.record)):
-        if path is not None:
-            print(f"{name:<8} {path}")
+    print_lines(picture=request.snapshot, levels=request.record)
 
 
 def _listening(interface: str, page: str | None) -> None:

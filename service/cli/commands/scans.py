@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from service.cli.printing import print_lines
 from service.cli.request_commands import product_command
 from service.requests.register import CompareRequest, FuseRequest, RegisterRequest
 
@@ -24,9 +25,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _register(result: "RegisterResult") -> bool:
-    print(f"scans    {result.scan_set_path}")
-    print(f"report   {result.report_path}")
-    print(f"joined   {result.joined} of {result.scans} scans")
+    print_lines(scans=result.scan_set_path, report=result.report_path, joined=f"{result.joined} of {result.scans} scans")
     if result.residual_m is not None:
         print(f"residual {1e3 * result.residual_m:.3g} mm across the surface (median of the pairs)")
     if result.sigma_m is not None and result.sigma_degrees is not None:
@@ -36,11 +35,7 @@ def _register(result: "RegisterResult") -> bool:
 
 def _fuse(result: "FuseResult") -> None:
     facts = result.facts
-    if result.mesh_path is not None:
-        print(f"mesh     {result.mesh_path}")
-    if result.asset_path is not None:
-        print(f"asset    {result.asset_path}")
-    print(f"report   {result.report_path}")
+    print_lines(mesh=result.mesh_path, asset=result.asset_path, report=result.report_path)
     fused = sum(scan["fused"] for scan in facts["scans"])
     print(f"surface  {facts['vertices']} vertices, {facts['faces']} faces at voxels of {1e3 * facts['voxel_m']:.4g} mm, from {fused} of "
           f"{len(facts['scans'])} scans; σ {1e3 * facts['sigma_m']['median']:.3g} mm in the median")
@@ -54,11 +49,7 @@ def _fuse(result: "FuseResult") -> None:
 
 
 def _compare(result: "CompareResult") -> bool:
-    print(f"scan     {result.deviations_path}")
-    print(f"picture  {result.picture_path}")
-    print(f"report   {result.report_path}")
-    if result.regions_path is not None:
-        print(f"regions  {result.regions_path}")
+    print_lines(scan=result.deviations_path, picture=result.picture_path, report=result.report_path, regions=result.regions_path)
     print(f"placed   to {1e3 * result.placement_sigma_m:.3g} mm (σ along the surface's normal)")
     print(f"deviates {1e3 * result.median_m:+.3g} mm in the median, {1e3 * result.rms_m:.3g} mm RMS; σ of a point "
           f"{1e3 * result.sigma_m:.3g} mm")

@@ -75,7 +75,7 @@ def _gray_phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Seq
 
 
 def _binary_cost(name: str, columns: int) -> Cost:
-    return Cost(name, planner.kary_count(columns), 2 * digit_count(columns, 2) + 2, planner.stripe_sigma(1))
+    return Cost(name, planner.kary_count(columns), 2 * digit_count(columns, 2) + 2, planner.STRIPE_SIGMA)
 
 
 def _periods(request: PlanRequest, columns: int) -> tuple[float, ...]:
@@ -134,7 +134,7 @@ CODES: dict[PatternCode, CodeRow] = {
                                                     stripe_px=request.stripe or 1),
         ("stripe", "base", "reflected"),
         lambda request, columns: Cost(f"kary, base {request.base}", planner.kary_count(columns, request.base),
-                                      digit_count(columns, request.base) + 2, planner.stripe_sigma(1))),
+                                      digit_count(columns, request.base) + 2, planner.STRIPE_SIGMA)),
     PatternCode.COLOR: CodeRow(
         stripe_decoder,
         lambda request, axis, extent: kary_patterns(extent, axis, base=request.base, reflected=request.reflected,

@@ -86,7 +86,7 @@ def make_plan(request: PlanRequest) -> tuple[planner.Plan, ...]:
         raise RequestError("the depth's precision needs baseline, distance and focal together: give all three, or none")
     across = request.axis == PatternAxis.ROW
     columns, rows = request.projector[::-1] if across else request.projector
-    costs = [planner.Cost(name, count, count, planner.stripe_sigma(1)) for name, count in (("point", columns * rows), ("line", columns))]
+    costs = [planner.Cost(name, count, count, planner.STRIPE_SIGMA) for name, count in (("point", columns * rows), ("line", columns))]
     try:
         costs += [cost(request, columns) for code in PatternCode if (cost := CODES[code].cost) is not None]
         return planner.tabulate(costs, frame_rate=request.frame_rate, rig=rig)

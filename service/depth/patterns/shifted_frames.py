@@ -20,6 +20,7 @@ from stage.capture.manifest import Frame
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
 from stage.patterns.kary import KaryCode
+from stage.spread import MAD_TO_SIGMA
 from stage.stack.planes import Planes
 
 LINES = 64
@@ -236,7 +237,7 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     for _ in range(ROUNDS):
         shift = np.linalg.lstsq(np.sqrt(weight)[:, None] * design, np.sqrt(weight) * aside, rcond=None)[0]
         rest = aside - design @ shift
-        spread = float(np.clip(1.4826 * np.median(np.abs(rest)), LEAST_SPREAD, MOST_SPREAD))
+        spread = float(np.clip(MAD_TO_SIGMA * np.median(np.abs(rest)), LEAST_SPREAD, MOST_SPREAD))
         weight = 1 / (1 + (rest / (2 * spread)) ** 2)
     if weight.mean() < FITTING:
         return None

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from service.scans.fusion.misplaced import Readings, Sample
+from stage.spread import MAD_TO_SIGMA
 
 PIXELS_APART = 4.0
 """The distance, in pixels, from which on two places share no pixel of either scan."""
@@ -31,7 +32,7 @@ def shared_sigma(samples: list[Sample], readings: list[Readings], used: list[int
     for other in used:
         distance = np.full(firsts[-1], np.nan)
         each = readings[other]
-        spread = 1.4826 * float(np.median(np.abs(each.distance))) if len(each.at) else 0.0
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(each.distance))) if len(each.at) else 0.0
         same = np.abs(each.distance) <= OTHER_SURFACE * np.maximum(each.expected, spread)
         distance[each.at[same]] = each.distance[same]
         products = distance[partner >= 0] * distance[partner[partner >= 0]]

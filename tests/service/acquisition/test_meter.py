@@ -15,6 +15,7 @@ from service.acquisition.meter import OBJECT_PART, SHARE, TARGET, meter
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.formats import images
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import make_scene, write_exr
 from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, controller
@@ -139,5 +140,5 @@ def test_a_virtual_camera_is_metered_and_left_at_the_longest_time_it_offers(tmp_
     found = json.loads((tmp_path / "meter" / "meter.json").read_text())
     assert found["proposed"]["exposure_s"] == proposed and found["proposed"]["factor"] == pytest.approx(proposed / 0.01)
     assert found["proposed"]["sure"] and found["camera_settings"]["shutterspeed"] == f"{proposed:.4f}s"
-    linear = ((grey / 255 + 0.055) / 1.055) ** 2.4
-    assert [reading["bright"] for reading in found["readings"]] == pytest.approx([linear] * LAMPS, rel=0.05)  # JPEG
+    linear = srgb_to_linear(np.full(LAMPS, grey / 255))
+    assert [reading["bright"] for reading in found["readings"]] == pytest.approx(linear, rel=0.05)  # JPEG

@@ -22,6 +22,7 @@ from stage.formats import images
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import Scene, make_scene, render, write_capture, write_exr
 from tests.scenes.patched_rigs import loopback, write_plan
 from tests.scenes.rigs import write_rig
@@ -97,8 +98,7 @@ def photographed(folder: Path, host: str, *faults: str) -> list:
 def shown_lamps(scene: Scene, capture: Path) -> list[int]:
     """Return the lamp of the scene whose light each picture of a capture is nearest to."""
     codes = np.array([images.read_pixels(capture / frame.image) for frame in Capture.open(capture).manifest.frames], dtype=np.float64)
-    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    return [int(np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin()) for each in seen]
+    return [int(np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin()) for each in srgb_to_linear(codes)]
 
 
 @pytest.mark.long

@@ -12,7 +12,8 @@ import pytest
 import service
 from stage.formats import exr
 from tests.marks import first_short
-from tests.reference.light_basis import relative_rms, render_ptm, render_rti, srgb, truncation
+from tests.reference.colour import srgb
+from tests.reference.light_basis import relative_rms, render_ptm, render_rti, truncation
 from tests.reference.sampling import lattice
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, render, write_capture, write_exr
 
@@ -73,8 +74,7 @@ def sample():
 
 def test_a_lambertian_object_without_shadow_is_three_images(relit, tmp_path):
     write_capture(tmp_path / "cap", SCENE)
-    outcome = relit("basis", tmp_path / "cap", "--out", tmp_path / "b.exr", "--count", "3")
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("basis", tmp_path / "cap", "--out", tmp_path / "b.exr", "--count", "3")
     assert outcome.out.splitlines()[:2] == [f"basis    {tmp_path}/b.exr", f"facts    {tmp_path}/b.exr.json"]
     assert outcome.out.splitlines()[2].endswith(f"3 coefficients a channel, 9 lights, {SCENE.mask.sum()} pixels")
     assert said(outcome) < HALF_ROUNDING  # in the stack and in the file
@@ -130,8 +130,7 @@ def test_the_error_under_lights_between_the_captured_is_that_of_relit_frames(rel
 def test_a_viewer_shows_what_was_said(relit, tmp_path, kind, name, count, most):
     images, directions, irradiance, mask = sample()
     options = [] if count is None else ["--count", count]
-    outcome = relit("basis", LAMBERT, "--cache", tmp_path / "cache", "--out", tmp_path / name, "--kind", kind, *options)
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("basis", LAMBERT, "--cache", tmp_path / "cache", "--out", tmp_path / name, "--kind", kind, *options)
     facts, data = facts_of(tmp_path / name), (tmp_path / name).read_bytes()
     lit = images / irradiance[:, None]
     assert facts["exposure"] == pytest.approx(1 / np.quantile(lit, 0.999), rel=1e-3)  # half rounding of that value

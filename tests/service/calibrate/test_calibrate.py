@@ -169,8 +169,7 @@ def test_light_of_the_room_is_told_by_the_dark_side_of_a_ball(relit, tmp_path, r
     assert ("the dark side of the ball has" in outcome.out) == said, outcome.out
     assert (max(light["dark_side"] or 0 for light in report_of(folder, "grey-ball")["lights"]) > 0.05) == said
     write_exr(folder / "off.exr", np.full((HEIGHT, WIDTH, 3), ambient))
-    frames = json.loads((folder / "capture.json").read_text())["frames"]
-    edit_manifest(folder, frames=[*frames, {"image": "off.exr", "light": {"type": "off"}}])
+    edit_manifest(folder, frames=lambda frames: [*frames, {"image": "off.exr", "light": {"type": "off"}}])
     assert "the dark side" not in relit.done("calibrate", "grey-ball", folder, "--ball", CIRCLE, *refined).out
 
 

@@ -13,6 +13,7 @@ from service.requests.chart import ChartKind, ChartRequest
 from stage.capture.capture import Capture
 from stage.colour.colour import rgb_matrix
 from stage.stack.correction import Correction
+from tests.reference.colour import srgb
 from tests.scenes.captures import edit_manifest, write_image
 from tests.scenes.chart import (
     CAMERA,
@@ -115,8 +116,7 @@ def test_a_chart_corrects_the_capture_and_the_report_says_by_how_much(relit, tmp
 def test_integers_in_another_space_and_a_chart_that_stands_on_its_head(relit, tmp_path):
     shown = picture(seen(), POSE)
     folder = shoot(tmp_path / "cap", [noisy(shown.pixels)])
-    turned = np.clip(noisy(shown.pixels), 0, 1)[::-1, ::-1]
-    encoded = np.where(turned <= 0.0031308, 12.92 * turned, 1.055 * turned ** (1 / 2.4) - 0.055)
+    encoded = srgb(noisy(shown.pixels)[::-1, ::-1])
     write_image(folder / "0.png", np.rint(encoded * 65535).astype(np.uint16))
     edit_manifest(folder, color_space="srgb_texture", frames=[{"image": "0.png", "light": {"type": "full"}}])
     printed = relit.done("calibrate", "chart", folder).out

@@ -12,6 +12,7 @@ from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr
 from stage.stack.correction import Correction
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr, write_image
 from tests.scenes.dng import RGGB, XYZ_TO_CAMERA, write_dng
 
@@ -66,10 +67,10 @@ def test_display_encoded_captures_keep_their_encoding(tmp_path):
     capture = Capture.open(folder)
     paths = [write_image(tmp_path / f"w{v}.png", np.full((SIZE, SIZE, 3), v, np.uint8)) for v in (50, 200)]
     mean = mean_image(paths, capture)
-    linear = [((v / 255 + 0.055) / 1.055) ** 2.4 for v in (50, 200)]
+    linear = srgb_to_linear(np.array([50, 200]) / 255)
     np.testing.assert_allclose(mean.pixels, np.mean(linear), rtol=1e-4)
     encoded = recorded_values(mean.pixels.astype(np.float32), capture)
-    np.testing.assert_allclose(((encoded + 0.055) / 1.055) ** 2.4, np.mean(linear), rtol=1e-4)
+    np.testing.assert_allclose(srgb_to_linear(encoded), np.mean(linear), rtol=1e-4)
     exr.write(tmp_path / "flat.exr", {c: encoded[..., i] for i, c in enumerate("RGB")}, color_space="srgb_texture", metadata={})
     np.testing.assert_allclose(mean_image([tmp_path / "flat.exr"], capture).pixels, mean.pixels, rtol=1e-4)
 

@@ -7,11 +7,9 @@ import pytest
 
 from stage.capture.capture import Capture
 from tests.reference import projector as reference
-from tests.scenes.captures import write_images, write_manifest
-from tests.scenes.depth import entry_of
 from tests.scenes.in_front import unit
 from tests.service.calibrate.solvers.test_procam import CAMERA, board_image
-from tests.service.calibrate.test_laser_planes import PLACEHOLDER, PLANES, POSES, WIDTH, calibrated
+from tests.service.calibrate.test_laser_planes import PLANES, POSES, WIDTH, calibrated, written
 
 pytestmark = pytest.mark.long
 
@@ -19,7 +17,7 @@ pytestmark = pytest.mark.long
 def board(pose):
     """Points [rows, cols, 3] of a board, and what it reflects."""
     rays = reference.pixel_rays(CAMERA)
-    return rays * (pose[:3, 3] @ pose[:3, 2] / (rays @ pose[:3, 2]))[..., None], board_image(pose)
+    return rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None], board_image(pose)
 
 
 def photograph(folder, pose, step_m=(0.0, 0.0, 0.0), second=0.0, aside_m=0.03):
@@ -34,10 +32,7 @@ def photograph(folder, pose, step_m=(0.0, 0.0, 0.0), second=0.0, aside_m=0.03):
         for part, beside in ((1.0, 0.0), (second, aside_m)) if plane is not None else ():
             glow = glow + part * 0.6 * np.exp(-(((points - plane[0]) @ unit(plane[1]) - beside) ** 2) / (2 * WIDTH**2))
         images.append(np.maximum(albedo * (0.2 + glow) + random.normal(0, 0.002, albedo.shape), 0))
-    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * len(PLANES), {"light": {"type": "off"}}], "{}.exr")
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "camera": {"projection": "perspective", **entry_of(CAMERA)},
-                            "frames": frames})
-    return folder
+    return written(folder, images)
 
 
 def check(folder, sigmas=3.0):

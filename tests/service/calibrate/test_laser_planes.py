@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError
-from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_images, write_manifest
 from tests.scenes.depth import entry_of
@@ -30,7 +29,12 @@ def photograph(folder, points, albedo, planes=PLANES, noise=0.002):
         glow = 0.0 if plane is None else 0.6 * np.exp(-(((points - plane[0]) @ unit(plane[1])) ** 2) / (2 * WIDTH**2))
         image = albedo * (0.2 + glow)
         images.append(np.maximum(image + random.normal(0, noise, image.shape), 0))
-    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * len(planes), {"light": {"type": "off"}}], "{}.exr")
+    return written(folder, images)
+
+
+def written(folder, images):
+    """A capture whose last image is under the light of the room, and the others under lasers that are still to be calibrated."""
+    frames = write_images(folder, images, [*[{"laser": PLACEHOLDER}] * (len(images) - 1), {"light": {"type": "off"}}], "{}.exr")
     write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "camera": {"projection": "perspective", **entry_of(CAMERA)},
                             "frames": frames})
     return folder
@@ -40,8 +44,7 @@ def boards(folder, chosen=POSES, planes=PLANES):
     rays = reference.pixel_rays(CAMERA)
     found = []
     for number, pose in enumerate(chosen):
-        normal = pose[:3, 2]
-        points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+        points = rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None]
         found.append(photograph(folder / f"pose{number}", points, board_image(pose), planes))
     return found
 
@@ -66,14 +69,12 @@ def test_planes_are_found_and_measure_an_object(relit, tmp_path):
         off = np.degrees(np.arccos(min(1.0, abs(np.array(laser.normal) @ unit(normal)))))
         assert off < 0.5 and off < 5 * entry["sigma_degrees"] + 0.1, (off, entry)
         assert abs((np.array(laser.point_m) - point) @ unit(normal)) < 0.002
-    assert relit("depth", scan, "--out", tmp_path / "out", "--device", "cpu").code == 0
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps, measured, _ = relit.depth(scan, "--device", "cpu")
     error = np.abs(maps.depth - truth)[maps.mask]
     assert maps.mask.sum() > 300 and np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.01
     # σ holds how far the planes are known: |e| / σ is 0.67 in the median if it is right, and at most 3 where errors are normal
     assert np.median(error / maps.sigma[maps.mask]) < 1 and np.quantile(error / maps.sigma[maps.mask], 0.99) < 3
-    assert not any("whether its planes are right" in words for words in json.loads((tmp_path / "out" / "report.json").read_text()).get(
-        "warnings", ()))
+    assert not any("whether its planes are right" in words for words in measured.get("warnings", ()))
 
 
 @pytest.mark.long

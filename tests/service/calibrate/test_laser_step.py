@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stage.capture.capture import Capture
-from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.step import CAMERA, HEIGHT, LASER, Step, laser_planes, photograph
@@ -63,8 +62,7 @@ def test_several_poses_and_a_scan(relit, tmp_path):
     assert tilt.max() < 0.15 and depth.max() < 0.004 and max(tilts.max(), depths.max()) < 3
     report = json.loads((folders[0] / "calibration.json").read_text())["laser-planes"]
     assert len(report["steps"]) == 3 and all(one["poses"] == 3 for one in report["planes"])
-    assert relit("depth", scan, "--out", tmp_path / "out", "--device", "cpu").code == 0
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps, *_ = relit.depth(scan, "--device", "cpu")
     truth = -step.seen(reference.pixel_rays(CAMERA))[..., 2]
     error = np.abs(maps.depth - truth)[maps.mask]
     assert maps.mask.sum() > 1000 and np.median(error) < 0.002
@@ -77,8 +75,7 @@ def test_poses_tell_a_camera_that_was_refocused(relit, tmp_path):
     outcome = calibrated(relit, *folders)
     assert outcome.code == 0 and "focal_px" not in outcome.out
     for folder in folders:
-        camera = json.loads((folder / "capture.json").read_text())["camera"]
-        edit_manifest(folder, camera={**camera, "focal_px": [1.04 * value for value in camera["focal_px"]]})
+        edit_manifest(folder, camera=lambda camera: {**camera, "focal_px": [1.04 * value for value in camera["focal_px"]]})
     outcome = calibrated(relit, *folders)
     report = json.loads((folders[0] / "calibration.json").read_text())["laser-planes"]
     assert outcome.code == 0 and "camera: the stripes of all poses fit best with 0.9" in outcome.out

@@ -9,13 +9,12 @@ import pytest
 from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.importers.opencv_file import read_matrices
-from stage.results.depth_maps import DepthMaps
 from tests.marks import first_short
 from tests.reference.projector import FLIP
 from tests.scenes import stereo
 from tests.scenes.captures import files_in, write_image
 from tests.scenes.depth import AMBIENT, CAMERA, POSE, PROJECTOR, make_scene
-from tests.scenes.stereo import Plane, Sphere
+from tests.scenes.projected import Ball, Wall
 
 SCENE = make_scene()
 LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded
@@ -66,8 +65,7 @@ SIZES = {"frameWidth": CAMERA.width, "frameHeight": CAMERA.height, "screenResX":
 def depth_of(relit, folder, *words):
     """Import a folder, solve it, and return the result and what was printed."""
     out = relit("import", words[0], folder, *words[1:]).well()
-    relit("depth", folder, "--out", folder / "out").well()
-    return DepthMaps.read(folder / "out" / "depth.exr"), out
+    return relit.depth(folder).maps, out
 
 
 def error(maps):
@@ -228,7 +226,7 @@ def test_without_a_calibration_the_columns_are_decoded_all_the_same(relit, tmp_p
 @pytest.fixture(scope="module")
 def pair():
     """Both views of a tilted plane and a sphere under dots, whether the second camera sees the place, and what is recorded."""
-    parts, dots = (Plane((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0)), Sphere((0.08, -0.04, -0.95), 0.11)), [stereo.dots(100, cell=3)]
+    parts, dots = (Wall((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.6), Ball((0.08, -0.04, -0.95), 0.11, 0.6)), [stereo.dots(100, cell=3)]
     left, right = (stereo.render(parts, dots, *camera, side=2) for camera in ((stereo.CAMERA,), (stereo.OTHER, stereo.POSE)))
     random = np.random.default_rng(0)
     return left, stereo.visible_to(parts, left.points, stereo.POSE), [stereo.recorded(view.images[0], random) for view in (left, right)]
@@ -265,8 +263,7 @@ def test_two_cameras(relit, tmp_path, pair, kind):
     if kind != "one file":  # alike from here on
         return
     assert other.name == "cam.1"
-    relit("depth", tmp_path / "pair", "--out", tmp_path / "out").well()
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    maps, *_ = relit.depth(tmp_path / "pair")
     off = np.abs(maps.depth - left.depth)[maps.mask & visible]  # a pixel of disparity is 19 to 27 mm at 1 to 1.2 m
     assert maps.mask[visible].mean() > 0.7 and np.median(off) < 0.006 and (off > 0.03).mean() < 0.02
 

@@ -7,7 +7,6 @@ import pytest
 from scipy.io import savemat
 
 from stage.capture.capture import Capture
-from stage.results.depth_maps import DepthMaps
 from stage.tof.raw_frames import read_correlations, read_histograms
 from tests.scenes.captures import files_in
 
@@ -26,8 +25,7 @@ def correlations(frequencies, phases, sign=-1):
 
 def solve(relit, folder, *words):
     out = relit("import", *words).well()
-    relit("depth", folder, "--out", folder / "out").well()
-    return DepthMaps.read(folder / "out" / "depth.exr"), out
+    return relit.depth(folder).maps, out
 
 
 def error(maps, truth=RANGE_M):

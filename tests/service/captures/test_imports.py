@@ -8,7 +8,6 @@ from scipy.io import savemat
 
 from service.captures.info import front_lights
 from stage.capture.capture import Capture
-from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, make_scene, render, write_exr, write_image
 
@@ -24,8 +23,7 @@ def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path)
     (folder / "lights.csv").write_text("x,y,z,r,g,b\n" + "\n".join(",".join(f"{v:.9g}" for v in row) for row in table) + "\n")
     outcome = relit("import", "olat", folder, "--axes", axes, "--vectors", vectors)
     assert outcome.code == 0 and f"capture  {folder}/capture.json" in outcome.out and "handed" in outcome.out
-    assert relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").code == 0
-    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    maps, *_ = relit.solve(folder, "--method", "robust")
     assert angles_degrees(maps.normal, scene.normal)[scene.mask].max() < 0.1  # half rounding of the stack
 
 
@@ -44,8 +42,7 @@ def test_the_scale_of_the_lights_gives_that_of_albedo(relit, tmp_path, layout):
     assert Capture.open(folder).manifest.irradiance_scale == "absolute"
     relit("import", layout, folder, *words, "--scale", reading).well()
     assert not (folder / "capture.previous.json").exists()  # nothing was replaced
-    relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").well()
-    albedo = SurfaceMaps.read(tmp_path / "maps" / "maps.exr").diffuse_albedo
+    albedo = relit.solve(folder, "--method", "robust").maps.diffuse_albedo
     assert np.abs(albedo - scene.albedo)[scene.mask].max() < 2e-3  # half rounding of the stack and of the layers
 
 
@@ -104,8 +101,7 @@ def test_leds_in_the_layout_of_near_ps_give_the_true_height(relit, tmp_path):
     assert "8 near lights" in out and "(MATLAB)" in out and "raw_ambient.png is subtracted" in out
     camera = Capture.open(tmp_path / "capture").camera
     assert np.allclose(camera.principal_px, np.array(camera.resolution) / 2) and np.allclose(camera.focal_px, dome.camera["focal_px"])
-    assert relit("solve", tmp_path / "capture", "--out", tmp_path / "maps", "--method", "robust").code == 0
-    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    maps, *_ = relit.solve(tmp_path / "capture", "--method", "robust")
     solved = maps.mask & dome.mask
     assert solved.sum() > 0.95 * dome.mask.sum()
     assert np.abs(maps.height - dome.points[..., 2])[solved].max() < 0.01 * dome.relief  # as the capture in relit's own layout is held to
@@ -133,8 +129,7 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     assert "8 far lights" in out and "1 images are skipped" in out and "crops the images" in out
     capture = Capture.open(tmp_path / "photos")
     assert np.isclose(capture.camera.pixel_size_m, 0.002) and len(capture.manifest.frames) == 8
-    assert relit("solve", tmp_path / "photos", "--out", tmp_path / "maps", "--method", "robust").code == 0
-    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    maps, *_ = relit.solve(tmp_path / "photos", "--method", "robust")
     assert angles_degrees(maps.normal, scene.normal)[scene.mask & maps.mask].max() < 0.1
     assert maps.mask.sum() > 0.9 * scene.mask.sum()
 

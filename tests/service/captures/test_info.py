@@ -13,6 +13,7 @@ from stage.capture.capture import Capture
 from stage.capture.lighting import check_solvable
 from stage.errors import ManifestError
 from stage.formats import exr
+from tests.reference.colour import srgb
 from tests.scenes import near_lights
 from tests.scenes.captures import edit_frame, make_scene, manifest_of, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.ellipsoid import ellipsoid
@@ -136,10 +137,6 @@ def test_negative_values_that_are_clipped_are_counted(tmp_path):
     assert fault.endswith("--clip-negative sets such values to 0")
     found = inspect(InfoRequest(capture=tmp_path, clip_negative=True))
     assert found.faults == [] and "3 pixels of 1 image were" in dict(found.facts)["clipped"]
-
-
-def srgb(linear):
-    return np.where(linear < 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def findings(folder, recorded, **changes):

@@ -10,6 +10,7 @@ from stage.formats import exr
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
 from tests.marks import first_short
+from tests.reference.colour import srgb
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
 from tests.scenes.depth import AMBIENT, BLACK_WHITE, NORMAL, POSE, PROJECTOR, gray_patterns, make_scene, phase_patterns, write_patterns
 
@@ -19,12 +20,6 @@ COLUMN_PX = 0.065
 """Metres of depth that a projector column is worth here, at most."""
 
 
-def solve(relit, folder, *arguments):
-    outcome = relit.done("depth", folder, "--out", folder / "out", *arguments)
-    assert "depth.exr" in outcome.out and "points.ply" in outcome.out
-    return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
-
-
 def off(maps: DepthMaps) -> np.ndarray:
     return np.abs(maps.depth - SCENE.depth)[maps.mask]
 
@@ -32,7 +27,8 @@ def off(maps: DepthMaps) -> np.ndarray:
 @pytest.mark.parametrize("suffix", ["png", "exr"])
 def test_gray_code_with_inverses(relit, tmp_path, suffix):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], suffix=suffix)
-    maps, report = solve(relit, tmp_path, "--device", "cpu")
+    maps, report, said = relit.depth(tmp_path, "--device", "cpu")
+    assert "depth.exr" in said and "points.ply" in said
     assert maps.mask[LIT].mean() > 0.97 and not maps.mask[~LIT].any()
     assert off(maps).max() < COLUMN_PX  # half a stripe, or one where a bit is in doubt
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= 1.0
@@ -51,7 +47,7 @@ def test_what_the_calibration_leaves_open_is_said(relit, tmp_path):
     for part, said in ((0.02, True), (1e-6, False)):
         manifest["projector"]["depth_sigma"] = part
         path.write_text(json.dumps(manifest))
-        maps, report = solve(relit, tmp_path)
+        maps, report, _ = relit.depth(tmp_path)
         assert report["found"]["calibration_sigma_m"] == pytest.approx(part * np.median(maps.depth[maps.mask]), rel=0.01)
         assert float(maps.provenance["relit:calibration_sigma_m"]) == report["found"]["calibration_sigma_m"]
         assert any("projector.depth_sigma" in sentence for sentence in report["warnings"]) == said
@@ -59,8 +55,8 @@ def test_what_the_calibration_leaves_open_is_said(relit, tmp_path):
 
 def test_edges_of_wide_stripes_are_refined(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column", stripe=8), *BLACK_WHITE])
-    refined, _ = solve(relit, tmp_path)
-    centres, report = solve(relit, tmp_path, "--no-refine")
+    refined, *_ = relit.depth(tmp_path)
+    centres, report, _ = relit.depth(tmp_path, "--no-refine")
     assert report["method"] == "gray with inverses"
     column = [np.median(np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]) for maps in (centres, refined)]
     assert column[0] > 1.5 and column[1] < 0.3
@@ -68,7 +64,7 @@ def test_edges_of_wide_stripes_are_refined(relit, tmp_path):
 
 def test_phase_numbered_by_gray(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
-    maps, report = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path)
     assert report["method"] == "phase numbered by gray"
     assert maps.mask[LIT].mean() > 0.97
     assert np.median(off(maps)) < 2e-5 and off(maps).max() < 2e-4  # 16 bits
@@ -76,7 +72,7 @@ def test_phase_numbered_by_gray(relit, tmp_path):
 
 def test_phase_with_noise_is_as_sure_as_it_says(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE], noise=0.01)
-    maps, _ = solve(relit, tmp_path, "--read-noise", 0.01, "--photon-gain", 0)
+    maps, *_ = relit.depth(tmp_path, "--read-noise", 0.01, "--photon-gain", 0)
     ratio = (maps.depth - SCENE.depth)[maps.mask] / maps.sigma[maps.mask]
     assert 0.8 < np.sqrt(np.mean(np.clip(ratio, -5, 5) ** 2)) < 1.2
 
@@ -85,7 +81,7 @@ def test_phase_with_noise_is_as_sure_as_it_says(relit, tmp_path):
 def test_both_axes_of_two_periods(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *phase_patterns("column", 144), *phase_patterns("row", 16),
                                      *phase_patterns("row", 144), {"code": "black"}])
-    maps, report = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path)
     assert maps.mask[LIT].mean() > 0.97
     assert off(maps).max() < 3e-4
     assert report["found"]["residual_px"]["p95"] < 0.05
@@ -119,9 +115,13 @@ def micro(*periods):
     ([*phase_patterns("column", 16), *kary(4, 3, 4, levels=[0, 0.33, 0.67, 1])], "phase numbered by kary", 0.01),
 ])
 def test_every_code(relit, tmp_path, patterns, name, worst_px):
-    write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE])
-    maps, report = solve(relit, tmp_path)
-    assert report["method"] == name
+    decodes(relit, tmp_path, [*patterns, *BLACK_WHITE], name, worst_px)
+
+
+def decodes(relit, folder, patterns, name, worst_px):
+    write_patterns(folder, SCENE, patterns)
+    maps, report, _ = relit.depth(folder)
+    assert report["found"]["codes"]["column"] == name
     assert maps.mask[LIT].mean() > 0.93
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
 
@@ -136,11 +136,7 @@ def test_every_code(relit, tmp_path, patterns, name, worst_px):
 ])
 def test_captures_without_white_and_black(relit, tmp_path, patterns, name, worst_px):
     """Phases tell what white and black frames would show; a period as long as the projector is wide numbers the others, or itself."""
-    write_patterns(tmp_path, SCENE, patterns)
-    maps, report = solve(relit, tmp_path)
-    assert report["found"]["codes"]["column"] == name
-    assert maps.mask[LIT].mean() > 0.93
-    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
+    decodes(relit, tmp_path, patterns, name, worst_px)
 
 
 def test_waves_with_an_offset(relit, tmp_path):
@@ -167,9 +163,8 @@ def test_waves_with_an_offset(relit, tmp_path):
 def test_the_projectors_response_is_heeded(relit, tmp_path, patterns, most_px):
     """Light = level^2.2: the mean of the wave lies at .36 of white, and the threshold of the bits half way all the same."""
     write_patterns(tmp_path, SCENE, patterns, gamma=2.2)
-    data = json.loads((tmp_path / "capture.json").read_text())
-    edit_manifest(tmp_path, projector={**data["projector"], "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
-    maps, _ = solve(relit, tmp_path)
+    edit_manifest(tmp_path, projector=lambda projector: {**projector, "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
+    maps, *_ = relit.depth(tmp_path)
     assert maps.mask[LIT].mean() > 0.93
     off_px = np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]
     assert off_px.max() <= most_px and np.median(off_px) < 0.5
@@ -190,15 +185,14 @@ def test_missing_frames_are_named(relit, tmp_path, patterns, words):
 def test_points_have_place_colour_and_normal(relit, tmp_path):
     scene = make_scene(sphere=False)
     write_patterns(tmp_path, scene, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
-    maps, _ = solve(relit, tmp_path, "--normals")
+    maps, *_ = relit.depth(tmp_path, "--normals")
     cloud = read_ply(tmp_path / "out" / "points.ply")
     assert np.abs(cloud.points - scene.points[maps.mask]).max() < 2e-4
     assert np.median(angles_degrees(cloud.normals, np.array(NORMAL) / np.linalg.norm(NORMAL))) < 1
     linear = scene.albedo[maps.mask]
-    linear = np.clip(linear / np.percentile(linear.max(axis=-1), 99), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    encoded = srgb(linear / np.percentile(linear.max(axis=-1), 99))
     assert np.abs(cloud.colours - 255 * encoded).max() < 1.5
-    solve(relit, tmp_path)
+    relit.depth(tmp_path)
     assert read_ply(tmp_path / "out" / "points.ply").normals is None
 
 
@@ -207,14 +201,14 @@ def test_the_mask_and_the_range_of_depths_hold(relit, tmp_path):
     mask = np.zeros(SCENE.depth.shape, np.uint8)
     mask[20:50, 20:70] = 255
     write_image(tmp_path / "mask.png", mask)
-    maps, report = solve(relit, tmp_path, "--far-m", 1.3)
+    maps, report, _ = relit.depth(tmp_path, "--far-m", 1.3)
     assert not maps.mask[mask == 0].any() and maps.depth.max() <= 1.3
     assert report["pixels"]["out_of_range"] > 0 and report["pixels"]["mask"] == 1500
 
 
 def test_saturated_readings_are_refused(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *phase_patterns("column", 144)], saturation=0.6)
-    maps, report = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path)
     bright = SCENE.albedo.max(axis=-1) * (AMBIENT + 0.8 * 0.85) > 0.61  # one of four steps is at 0.85 of full on or above
     assert report["pixels"]["saturated"] > 0 and not maps.mask[bright & LIT].any()
 
@@ -223,10 +217,10 @@ def test_saturated_readings_are_refused(relit, tmp_path):
                           [*gray_patterns("column", stripe=4), *gray_patterns("row", stripe=4)]])
 def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], noise=0.01)
-    whole, _ = solve(relit, tmp_path)
+    whole, *_ = relit.depth(tmp_path)
     monkeypatch.setattr("stage.stack.planes.BAND_BYTES", 100_000)
     monkeypatch.setattr("stage.stack.planes.MEMORY_BYTES", 0)
-    parts, _ = solve(relit, tmp_path)
+    parts, *_ = relit.depth(tmp_path)
     assert (whole.depth == parts.depth).all() and (whole.status == parts.status).all()
 
 
@@ -238,8 +232,7 @@ def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
 ], ids=["millimetres", "turned", "nowhere", "near"])
 def test_impossible_devices_are_named(relit, tmp_path, pose, options, words):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
-    data = json.loads((tmp_path / "capture.json").read_text())
-    edit_manifest(tmp_path, projector={**data["projector"], "camera_from_projector": pose.tolist()})
+    edit_manifest(tmp_path, projector=lambda projector: {**projector, "camera_from_projector": pose.tolist()})
     fails(relit, tmp_path, words, *options)
 
 
@@ -251,9 +244,8 @@ def fails(relit, folder, words, *arguments):
 def test_two_frames_of_one_pattern_are_named(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *gray_patterns("column")[:1]])
     fails(relit, tmp_path, "show one pattern")
-    data = json.loads((tmp_path / "capture.json").read_text())
     write_image(tmp_path / "off.png", np.zeros(SCENE.depth.shape, np.uint16))
-    edit_manifest(tmp_path, frames=[{"image": "off.png", "light": {"type": "off"}}, *data["frames"]])
+    edit_manifest(tmp_path, frames=lambda frames: [{"image": "off.png", "light": {"type": "off"}}, *frames])
     fails(relit, tmp_path, r"frames: frames 1 and 15 show one pattern \(column gray bit 6")
 
 
@@ -279,10 +271,10 @@ def test_frames_of_another_kind(relit, tmp_path):
 
 def test_a_part_of_the_images_has_the_depth_of_the_whole(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
-    whole, _ = solve(relit, tmp_path)
+    whole, *_ = relit.depth(tmp_path)
     rows, cols = whole.mask.shape
     x, y, width, height = cols // 4, rows // 5, cols // 2, rows // 2
-    part, report = solve(relit, tmp_path, "--crop", f"{x},{y},{width},{height}")
+    part, report, _ = relit.depth(tmp_path, "--crop", f"{x},{y},{width},{height}")
     inside = (slice(y, y + height), slice(x, x + width))
     both = part.mask & whole.mask[inside]
     assert both.sum() > 0.995 * whole.mask[inside].sum()  # pixels beside the border of the part are doubted without their neighbours

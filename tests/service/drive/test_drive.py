@@ -15,15 +15,14 @@ from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
 from tests.marks import first_short
 from tests.scenes.captures import write_exr
-from tests.scenes.rigs import NORMALS, SUN, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
+from tests.scenes.rigs import NORMALS, SUN, irradiance, lamps_irradiance, read_levels, rms, sampled, write_rig, write_sky
 from tests.service.owl import write_small_owl
 
 
 @pytest.fixture
 def drive(relit, tmp_path):
     def run(*options, rig="rig.json", out="cues"):
-        outcome = relit("drive", tmp_path / rig, "--out", tmp_path / out, *options)
-        assert outcome.code == 0, outcome.err
+        relit.done("drive", tmp_path / rig, "--out", tmp_path / out, *options)
         return read_levels(tmp_path / out), json.loads((tmp_path / out / "report.json").read_text())
     return run
 
@@ -97,12 +96,8 @@ def test_it_is_nearer_than_sampling_an_eight_bit_panorama_at_the_lamps(drive, tm
     radiance = write_sky(tmp_path / "sky.exr", "sun")
     truth = irradiance(radiance)
     (levels,), _ = drive("--environment", tmp_path / "sky.exr")
-    x, y, z = directions.T
-    rows, columns = radiance.shape[:2]
-    row, column = (np.arccos(y) / np.pi * rows).astype(int), (np.arctan2(x, -z) / (2 * np.pi) % 1 * columns).astype(int)
-    sampled = np.clip(radiance, 0, 1)[row, column]
-    sampled = np.round(sampled * 255) / 255 * 4 * np.pi / 128
-    assert rms(np.maximum(NORMALS @ directions.T, 0) @ sampled, truth) > 5 * rms(lamps_irradiance(rig, levels), truth)
+    panorama = np.maximum(NORMALS @ directions.T, 0) @ sampled(radiance, directions)
+    assert rms(panorama, truth) > 5 * rms(lamps_irradiance(rig, levels), truth)
 
 
 @pytest.mark.long
@@ -198,16 +193,14 @@ def test_a_chart_is_shown_and_judged_under_both_lights(drive, tmp_path):
 def test_the_levels_light_the_owl_as_relight_does(relit, drive, tmp_path):
     """Sums of the captured images at the levels of a rig made of the capture, of 16 bits: within a thousandth of relit relight."""
     owl_capture = write_small_owl(tmp_path / "owl", 4)
-    outcome = relit("rig", "from-capture", owl_capture, "--out", tmp_path / "rig.json")
-    assert outcome.code == 0, outcome.err
+    relit.done("rig", "from-capture", owl_capture, "--out", tmp_path / "rig.json")
     write_sky(tmp_path / "sky.exr", "patches", scale=0.1)
     (tmp_path / "cues").mkdir()
     (tmp_path / "cues" / "predicted.0002.exr").write_text("of an earlier run")
     (levels,), report = drive("--environment", tmp_path / "sky.exr", "--capture", owl_capture)
     assert [path.name for path in (tmp_path / "cues").glob("predicted.*")] == ["predicted.0001.exr"]
     assert report["limits"]["frames"] == 0
-    outcome = relit("relight", owl_capture, "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f.#.exr", "--matte", "none")
-    assert outcome.code == 0, outcome.err
+    relit.done("relight", owl_capture, "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f.#.exr", "--matte", "none")
     channels, _ = exr.read(tmp_path / "f.1.exr")
     truth = np.stack([channels[c].astype(np.float64) for c in "RGB"], axis=-1)
     manifest = json.loads((owl_capture / "capture.json").read_text())
@@ -235,6 +228,5 @@ def test_what_cannot_be_driven_is_one_sentence(relit, tmp_path, change, options,
     (tmp_path / "rig.json").write_text(json.dumps(rig | change))
     write_sky(tmp_path / "sky.exr", "sun", rows=16)
     given = [tmp_path / option if option.endswith("exr") else option for option in options]
-    outcome = relit("drive", tmp_path / "rig.json", "--out", tmp_path / "cues", *given)
-    assert outcome.code == 2 and named in outcome.err and outcome.err.count("\n") == 1
+    relit("drive", tmp_path / "rig.json", "--out", tmp_path / "cues", *given).refused(named)
     assert not (tmp_path / "cues").exists()

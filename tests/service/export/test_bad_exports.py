@@ -53,7 +53,8 @@ def test_maps_that_are_no_surface(relit, tmp_path, maps, suffix):
 
 @pytest.mark.parametrize(("maps", "out", "words"), [
     ("none", "a.usdz", "none: is not there: run `relit solve` or `relit depth` first"),
-    ("empty", "a.usdz", "empty/maps.exr: is not there: run `relit solve` or `relit"), ("maps.exr", "a.obj", "a.obj")])
+    ("empty", "a.usdz", "empty/maps.exr: is not there: run `relit solve` or `relit"),
+    ("maps.exr", "a.gltf", ".usda, .usdc or .usdz for USD, or .glb for glTF")])
 def test_maps_that_are_not_there_and_an_asset_of_no_kind(relit, tmp_path, maps, out, words):
     (tmp_path / "empty").mkdir()
     BALL.write(tmp_path / "maps.exr")
@@ -136,8 +137,8 @@ def test_an_asset_that_is_grey_or_clipped_is_said_and_a_version_is_a_text(relit,
     assert relit("export", tmp_path, "--out", tmp_path / "a.usdz").well().splitlines()[2:] == [f"warning  {said}"]
     dataclasses.replace(BALL, diffuse_albedo=np.full_like(BALL.diffuse_albedo, 1.5)).write(tmp_path / "maps.exr")
     assert f"{BALL.mask.sum()} pixels have a value outside 0…1" in relit("export", tmp_path, "--out", tmp_path / "a.usdz").well()
-    outcome = relit("export", tmp_path, "--out", tmp_path / "b.usdz", "--version", "")
-    assert outcome.code == 2 and "version" in outcome.err and not (tmp_path / "b.usdz").exists()
+    relit("export", tmp_path, "--out", tmp_path / "b.usdz", "--version", "").refused("version")
+    assert not (tmp_path / "b.usdz").exists()
 
 
 @pytest.mark.parametrize(("ambiguous", "words"), [(1.0, "no normal is sure"), (0.5, "% of the solved normals are ambiguous"), (0.1, None)])

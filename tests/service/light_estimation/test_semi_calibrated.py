@@ -8,6 +8,7 @@ from service.light_estimation.lambertian import fit_lambertian, median_of, suspe
 from service.light_estimation.semi_calibrated import check_directions, fit_intensities, light_from_elsewhere, uncertainty_of
 from stage.errors import CalibrationError
 from tests.marks import first_short
+from tests.reference.colour import linear_to_srgb
 from tests.scenes.captures import angles_degrees, ring
 from tests.scenes.ellipsoid import ellipsoid
 from tests.service.calibrate.solvers.balls import spread, unit
@@ -209,8 +210,7 @@ def test_exposures_are_part_of_what_was_recorded():
     exposure = np.exp(np.random.default_rng(2).normal(size=16))
     recorded = given.radiance * exposure[:, None, None]
     recorded /= recorded.max()
-    seen = np.where(recorded < 0.0031308, 12.92 * recorded, 1.055 * np.maximum(recorded, 1e-9) ** (1 / 2.4) - 0.055)
-    found = explain(given._replace(radiance=seen / exposure[:, None, None], exposure=exposure))
+    found = explain(given._replace(radiance=linear_to_srgb(recorded) / exposure[:, None, None], exposure=exposure))
     assert found is not None and found.cause is Cause.ENCODED and found.left < 0.03
 
 

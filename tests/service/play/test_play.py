@@ -187,8 +187,7 @@ def test_an_error_turns_the_lamps_dark(tmp_path, monkeypatch):
 def test_the_command_says_what_was_sent(tmp_path, relit):
     rig = write_rig_file(tmp_path / "rig.json", ring(2), host=loopback())
     cues = write_cues_file(tmp_path / "cues.json", rig, counted_steps(2, 6))
-    outcome = relit("play", cues, rig, "--fps", "200")
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("play", cues, rig, "--fps", "200")
     assert outcome.out.splitlines()[0] == "frames   2 sent; the lamps are dark" and outcome.out.splitlines()[1].startswith("late     ")
 
 

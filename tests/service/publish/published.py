@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from tests.reference.light_basis import srgb
+from tests.reference.colour import srgb
 from tests.scenes.captures import make_scene, render, rgb, write_capture
 
 SIZE = 300

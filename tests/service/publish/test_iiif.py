@@ -11,7 +11,7 @@ from service.requests.publish import PublishRequest
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
 from stage.colour.configuration import current
-from tests.reference.light_basis import srgb
+from tests.reference.colour import srgb
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.publish.published import image
 

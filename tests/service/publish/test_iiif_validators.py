@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.publish.published import served
 
@@ -31,7 +32,7 @@ def test_the_image_validator_finds_nothing(relit, tmp_path):
 
     known = ValidationInfo()
     colours = np.array(known.colorInfo).swapaxes(0, 1) / 255  # they are in columns
-    linear = np.where(colours > 0.04045, ((colours + 0.055) / 1.055) ** 2.4, colours / 12.92)  # IEC 61966-2-1
+    linear = srgb_to_linear(colours)
     scene = make_scene(size=10 * SQUARE, lights=3)
     white = np.ones_like(scene.irradiance)
     squares = linear.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.reference.light_basis import srgb
+from tests.reference.colour import srgb
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture
 from tests.service.publish.published import SIZE, dome, image, levels_rms, sample, shown, tiles_joined
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from service.relight.environments import Environments
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import write_exr, write_radiance
 
 REC709 = "lin_rec709_scene"
@@ -78,7 +79,7 @@ def test_radiance_maps_of_another_encoding_are_said(tmp_path, lines, said):
 
 
 @pytest.mark.parametrize(("declared", "value", "wanted", "said"), [
-    ("sRGB", 0.5, ((0.5 + 0.055) / 1.055) ** 2.4, False), ("sRGB", 3.0, ((3.0 + 0.055) / 1.055) ** 2.4, True), ("Linear", 3.0, 3.0, False)])
+    ("sRGB", 0.5, srgb_to_linear(0.5), False), ("sRGB", 3.0, srgb_to_linear(3.0), True), ("Linear", 3.0, 3.0, False)])
 def test_the_space_of_older_openimageio_is_heeded(tmp_path, declared, value, wanted, said):
     """Grey by the formula of IEC 61966-2-1; what is decoded above white is said."""
     environments = Environments(write_exr(tmp_path / "sky.exr", np.full((16, 32, 3), value), **{"oiio:ColorSpace": declared}))
@@ -90,7 +91,7 @@ def test_the_space_of_older_openimageio_is_heeded(tmp_path, declared, value, wan
 def test_maps_of_8_bits_are_said(tmp_path, encoded, dtype):
     """A sky of 8 bits as it is recorded, or decoded by the formula of IEC 61966-2-1."""
     codes = np.random.default_rng(2).integers(0, 256, (32, 64, 3)) / 255
-    light = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    light = srgb_to_linear(codes)
     for space, said in ((REC709, [encoded]), ("srgb_texture", [False])):
         environments = Environments(write_exr(tmp_path / "sky.exr", codes if encoded else light, dtype, colorInteropID=space))
         environments.read(tmp_path / "sky.exr", REC709)

@@ -161,8 +161,7 @@ def test_the_beauty_is_premultiplied_by_its_matte(relit, tmp_path):
     sky = write_exr(tmp_path / "sky.exr", np.ones((16, 32, 3)))
 
     def frame(name, *options):
-        outcome = relit("relight", folder, "--environment", sky, "--out", tmp_path / name / "a.#.exr", *options)
-        assert outcome.code == 0
+        outcome = relit.done("relight", folder, "--environment", sky, "--out", tmp_path / name / "a.#.exr", *options)
         return exr.read(tmp_path / name / "a.1.exr")[0], outcome.out
 
     soft, out = frame("soft", "--exposure", "1", "--report", tmp_path / "r.json")
@@ -207,8 +206,7 @@ def test_bad_options_of_layers(relit, tmp_path, monkeypatch, options, words):
     (tmp_path / "keys.json").write_text(json.dumps(KEYS))
     (tmp_path / "many.json").write_text(json.dumps({"schema": "relit.keys/1", "lights": KEYS["lights"][:1] * 32}))
     write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))
-    outcome = relit("relight", "cap", "--environment", "sky.exr", "--out", "f/a.#.exr", *options)
-    assert outcome.code == 2 and outcome.err.count("\n") == 1 and words in outcome.err
+    relit("relight", "cap", "--environment", "sky.exr", "--out", "f/a.#.exr", *options).refused(words)
     assert not (tmp_path / "f").exists()
 
 

@@ -158,9 +158,8 @@ def test_maps_with_another_camera_guide_with_a_warning(relit, scene, tmp_path):
     folder, _ = scene
     words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--maps", folder / "maps")
     assert "another camera" not in relit(*words, "--out", tmp_path / "a.#.exr").out
-    camera = json.loads((folder / "cap" / "capture.json").read_text())["camera"]
     copy = shutil.copytree(folder / "cap", tmp_path / "cap")
-    edit_manifest(copy, camera={**camera, "pixel_size_m": 0.5})
+    edit_manifest(copy, camera=lambda camera: {**camera, "pixel_size_m": 0.5})
     assert "another camera.pixel_size_m than" in relit(words[0], copy, *words[2:], "--out", tmp_path / "b.#.exr").out
 
 

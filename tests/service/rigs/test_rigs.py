@@ -25,15 +25,13 @@ EMITTERS = """<Emitter Name="Red LED" Color="0.64,0.33,20"/><Emitter Name="Green
 def test_a_rig_is_made_of_a_capture(relit, tmp_path):
     """Directions and irradiances are those of the manifest; each lamp has channels of its own."""
     capture = write_small_owl(tmp_path / "owl", 4)
-    outcome = relit("rig", "from-capture", capture, "--out", tmp_path / "rig.json", "--universe", "5")
-    assert outcome.code == 0, outcome.err
+    relit.done("rig", "from-capture", capture, "--out", tmp_path / "rig.json", "--universe", "5")
     rig = read_rig(tmp_path / "rig.json")
     lit = [frame for frame in json.loads((capture / "capture.json").read_text())["frames"] if frame["light"]["type"] == "distant"]
     assert rig.directions == pytest.approx(np.array([frame["light"]["direction"] for frame in lit]), abs=1e-6)
     assert [sum(p.irradiance[c] for p in lamp.primaries) for lamp in rig.lights for c in range(3)] == pytest.approx(
         [value for frame in lit for value in frame["light"]["irradiance"]])
-    outcome = relit("rig", "check", tmp_path / "rig.json", "--picture", tmp_path / "dome.png")
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("rig", "check", tmp_path / "rig.json", "--picture", tmp_path / "dome.png")
     assert "sacn 5: 510 channels" in outcome.out and (tmp_path / "dome.png").stat().st_size > 1000
 
 
@@ -48,9 +46,8 @@ def test_check_names_what_is_wrong(relit, tmp_path):
 
 def test_a_rig_is_made_of_a_table(relit, tmp_path):
     (tmp_path / "dome.csv").write_text("name,x,y,z,universe,channel\nA,0,0,1,2,7\nB,0,3,4,2,11\n")
-    outcome = relit("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json", "--primaries", "white", "--bits", "16",
-                    "--protocol", "artnet", "--irradiance", "0.5")
-    assert outcome.code == 0, outcome.err
+    relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json", "--primaries", "white", "--bits", "16",
+               "--protocol", "artnet", "--irradiance", "0.5")
     lamp = read_rig(tmp_path / "rig.json").lights[1]
     assert lamp.direction == pytest.approx((0, 0.6, 0.8)) and lamp.primaries[0].irradiance == (0.5, 0.5, 0.5)
     assert lamp.address is not None
@@ -68,8 +65,7 @@ def test_a_rig_is_made_of_a_table(relit, tmp_path):
 ])
 def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
     (tmp_path / "dome.csv").write_text(text)
-    outcome = relit("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json")
-    assert outcome.code == 2 and named in outcome.err and outcome.err.count("\n") == 1
+    relit("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json").refused(named)
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -103,9 +99,8 @@ def test_a_scene_in_metres_is_said(relit, tmp_path, unit, said):
 def test_more_lamps_plan_a_smaller_error(relit, tmp_path):
     write_sky(tmp_path / "sky.exr", "sun", rows=32)
     write_rig(tmp_path / "rig.json", fibonacci_sphere(64), name='the "new" dome')
-    outcome = relit("rig", "plan", "--environment", tmp_path / "sky.exr", "--lights", "16,64,256", "--rig", tmp_path / "rig.json",
-                    "--out", tmp_path / "plan")
-    assert outcome.code == 0, outcome.err
+    relit.done("rig", "plan", "--environment", tmp_path / "sky.exr", "--lights", "16,64,256", "--rig", tmp_path / "rig.json",
+               "--out", tmp_path / "plan")
     with open(tmp_path / "plan" / "plan.csv", newline="") as file:
         *rows, given = csv.DictReader(file)
     assert given == {**rows[1], "rig": 'the "new" dome'}  # the same directions
@@ -162,8 +157,7 @@ def mvr(children: str, **types: bytes) -> bytes:
 
 def made(relit, folder, content: bytes, *options):
     (folder / "scene.mvr").write_bytes(content)
-    outcome = relit("rig", "from-mvr", folder / "scene.mvr", "--out", folder / "rig.json", *options)
-    assert outcome.code == 0, outcome.err
+    outcome = relit.done("rig", "from-mvr", folder / "scene.mvr", "--out", folder / "rig.json", *options)
     return read_rig(folder / "rig.json"), outcome.out
 
 
@@ -271,8 +265,7 @@ def test_fixtures_of_one_name_are_told_apart_and_hazers_left_out(relit, tmp_path
 ])
 def test_a_wrong_scene_is_one_sentence(relit, tmp_path, content, named):
     (tmp_path / "scene.mvr").write_bytes(content)
-    outcome = relit("rig", "from-mvr", tmp_path / "scene.mvr", "--out", tmp_path / "rig.json")
-    assert outcome.code == 2 and named in outcome.err and outcome.err.count("\n") == 1
+    relit("rig", "from-mvr", tmp_path / "scene.mvr", "--out", tmp_path / "rig.json").refused(named)
     assert not (tmp_path / "rig.json").exists()
 
 

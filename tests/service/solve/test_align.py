@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stage.formats import exr
-from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, files_in, write_exr
 from tests.scenes.moving import RADIUS, Subject, write_moving
 
@@ -19,8 +18,7 @@ def errors(relit, folder, subject, *arguments) -> np.ndarray:
 
     Aligned normals must be solved; unaligned ones may be unsure.
     """
-    relit.done("solve", folder, "--method", "lambert", "--out", folder / "out", *arguments)
-    maps = SurfaceMaps.read(folder / "out" / "maps.exr", unsure=True)
+    maps, *_ = relit.solve(folder, "--method", "lambert", *arguments, unsure=True)
     inner = np.hypot(*subject.body(0)) < RADIUS * subject.size - 4
     assert (maps.mask if "--align" in arguments else maps.estimated)[inner].mean() > 0.99
     return angles_degrees(maps.normal, subject.normal(0))[inner & maps.estimated]
@@ -66,11 +64,10 @@ def test_the_report_and_the_maps_say_that_frames_were_aligned(relit, tmp_path):
 @pytest.mark.long
 def test_another_time_may_be_named(relit, tmp_path):
     write_moving(tmp_path, GLIDING)
-    relit.done("solve", tmp_path, "--align-to", "10.exr", "--method", "lambert", "--out", tmp_path / "out")
-    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    maps, report, _ = relit.solve(tmp_path, "--align-to", "10.exr", "--method", "lambert")
     inner = np.hypot(*GLIDING.body(5)) < RADIUS * GLIDING.size - 4
     assert np.median(angles_degrees(maps.normal, GLIDING.normal(5))[inner & maps.mask]) < 0.15
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["motion"]["reference"] == "10.exr"
+    assert report["motion"]["reference"] == "10.exr"
 
 
 @pytest.mark.long
@@ -116,7 +113,6 @@ def test_a_constant_subject_moves_nowhere(relit, tmp_path):
     write_moving(tmp_path / "cap", Subject(size=16), "TLLLLT", mask=None)
     for index in range(6):
         write_exr(tmp_path / "cap" / f"{index:02d}.exr", np.ones((16, 16, 3)))
-    solved = relit("solve", tmp_path / "cap", "--align", "--method", "lambert", "--max-sigma", "180", "--out", tmp_path / "out")
-    assert solved.code == 1  # no normal counts as solved
-    motion = json.loads((tmp_path / "out" / "report.json").read_text())["motion"]
+    _, report, _ = relit.solve(tmp_path / "cap", "--align", "--method", "lambert", "--max-sigma", "180", code=1)  # no normal is solved
+    motion = report["motion"]
     assert motion["intervals"][0]["displacement_px"] == {"median": 0, "max": 0} and motion["no_reading_fraction"] == 0

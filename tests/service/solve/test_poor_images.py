@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from stage.results.maps import SurfaceMaps
 from tests.marks import first_short
 from tests.scenes.captures import Scene, angles_degrees, render, ring, write_capture
 
@@ -24,8 +23,7 @@ def waves(rows: int, cols: int, lights: int) -> Scene:
 def test_thin_images_are_solved(relit, tmp_path, shape, method):
     scene = waves(*shape, 9)
     write_capture(tmp_path, scene)
-    relit.done("solve", tmp_path, "--method", method, "--out", tmp_path / "out")
-    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    maps, *_ = relit.solve(tmp_path, "--method", method)
     assert maps.mask.all() and angles_degrees(maps.normal, scene.normal).max() < 0.1  # half rounding of nine readings
 
 
@@ -35,8 +33,7 @@ def test_a_lamp_in_the_picture(relit, tmp_path, method):
     scene = waves(20, 30, 9)
     scene.images[:, 10, 12] = 60000 * scene.directions[:, 2:]
     write_capture(tmp_path, scene)
-    relit.done("solve", tmp_path, "--method", method, "--out", tmp_path / "out")
-    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    maps, *_ = relit.solve(tmp_path, "--method", method)
     assert np.isfinite(maps.diffuse_albedo).all() and maps.diffuse_albedo[10, 12].min() > 6e4
     others = scene.mask.copy()
     others[10, 12] = False

@@ -10,7 +10,6 @@ import pytest
 from service.requests.solve import Method
 from service.solve.methods.methods import METHODS
 from stage.formats import exr
-from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, files_in, make_scene, write_capture
 
 SCENE = make_scene(size=16, lights=7)
@@ -19,10 +18,9 @@ SCENE = make_scene(size=16, lights=7)
 @pytest.mark.parametrize("method", ["lambert", "robust"])
 def test_solve_finds_the_normals_and_albedo_that_were_rendered(relit, tmp_path, method):
     write_capture(tmp_path / "cap", SCENE)
-    outcome = relit.done("solve", tmp_path / "cap", "--method", method, "--out", tmp_path / "out")
-    assert outcome.out.splitlines()[:2] == [f"maps     {tmp_path}/out/maps.exr", f"report   {tmp_path}/out/report.json"]
-    assert outcome.out.splitlines()[2] == f"pixels   {SCENE.mask.sum()} ok"
-    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    maps, _, said = relit.solve(tmp_path / "cap", "--method", method, out=tmp_path / "out")
+    assert said.splitlines()[:3] == [f"maps     {tmp_path}/out/maps.exr", f"report   {tmp_path}/out/report.json",
+                                     f"pixels   {SCENE.mask.sum()} ok"]
     assert np.array_equal(maps.mask, SCENE.mask)
     # half rounding in the stack, up to 2^-11 of each reading, gives 0.02 degrees at this tilt of the lights
     assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.05
@@ -32,8 +30,7 @@ def test_solve_finds_the_normals_and_albedo_that_were_rendered(relit, tmp_path, 
 
 def test_solve_finds_the_height_of_the_cap(relit, tmp_path):
     write_capture(tmp_path / "cap", SCENE, camera={"projection": "orthographic", "resolution": [16, 16], "pixel_size_m": 0.01})
-    assert relit("solve", tmp_path / "cap", "--out", tmp_path / "out").code == 0
-    maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
+    maps, *_ = relit.solve(tmp_path / "cap")
     radius = 0.08 / np.sin(np.radians(45))
     x, y = maps.camera.plane_coordinates()
     truth = np.sqrt(np.where(SCENE.mask, radius**2 - x**2 - y**2, radius**2))
@@ -45,8 +42,7 @@ def test_solve_finds_the_height_of_the_cap(relit, tmp_path):
 
 def test_the_report_and_the_maps_say_where_they_come_from(relit, tmp_path):
     write_capture(tmp_path / "cap", SCENE)
-    relit("solve", tmp_path / "cap", "--method", "lambert", "--device", "cpu", "--out", tmp_path / "out")
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    _, report, _ = relit.solve(tmp_path / "cap", "--method", "lambert", "--device", "cpu", out=tmp_path / "out")
     assert report["schema"] == "relit.report/1" and report["method"] == "lambert" and report["device"].startswith("cpu")
     assert report["inputs"]["name"] == "cap" and report["inputs"]["frames"] == 7 and report["inputs"]["resolution"] == [16, 16]
     assert report["pixels"]["mask"] == report["pixels"]["ok"] == int(SCENE.mask.sum())

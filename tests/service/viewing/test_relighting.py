@@ -10,6 +10,7 @@ from service.viewing import relighting
 from service.viewing.view_files import view
 from stage.formats import exr
 from tests.marks import first_short
+from tests.reference.colour import srgb
 from tests.reference.relight import texel_directions, texel_solid_angles
 from tests.reference.view import View
 from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr
@@ -170,15 +171,10 @@ def test_the_basis_of_tiles_loses_less_than_the_best_of_the_whole_image_and_says
         weights = found.weights()[row, col]
         truth, shown = np.einsum("lrq,lc->rqc", images, weights), found.lit(weights)
         white = np.quantile(truth.max(axis=2), 0.99)
-        levels.append(255 * np.abs(encoded(truth / white) - encoded(shown / white)).mean())
+        levels.append(255 * np.abs(srgb(truth / white) - srgb(shown / white)).mean())
     assert held["key_lights"] == 32 and held["mean_levels"] > 0.1
     assert 0.5 < np.mean(levels) / held["mean_levels"] < 2
     assert max(levels) < 1.5 * held["largest_levels"]
-
-
-def encoded(linear: np.ndarray) -> np.ndarray:
-    clipped = np.clip(linear, 0, 1)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
 @first_short("factor", [1, 1e-9, 1e7])

@@ -141,9 +141,7 @@ def test_ambient_light_is_shown_and_does_not_darken_the_exposure(tmp_path, relit
     write_capture(tmp_path / "cap", scene)
     relit("view", tmp_path / "cap", "--out", tmp_path / "plain")
     write_exr(tmp_path / "cap" / "off.exr", np.zeros((16, 16, 3)))
-    data = json.loads((tmp_path / "cap" / "capture.json").read_text())
-    data["frames"].append({"image": "off.exr", "light": {"type": "off"}})
-    write_manifest(tmp_path / "cap", data)
+    edit_manifest(tmp_path / "cap", frames=lambda frames: [*frames, {"image": "off.exr", "light": {"type": "off"}}])
     relit("view", tmp_path / "cap", "--out", tmp_path / "out")
     plain, found = View(tmp_path / "plain").facts, View(tmp_path / "out").facts
     assert found["exposure"] == plain["exposure"] and found["frames"][4]["label"] == "off light" and found["frames"][4]["dark"] == 1
@@ -337,7 +335,6 @@ def test_a_capture_under_lights_that_nobody_has_measured_is_relit_under_those_th
     found = strict((tmp_path / "maps" / "report.json").read_text())["found"]["unknown_lights"]["directions"]
     assert np.allclose([frame["direction"] for frame in solved["frames"]], found, atol=1e-5)  # the report has five digits
     assert solved["relight"]["terms"] > 3 and solved["samples"] is not None
-    del manifest["frames"][-1]
-    (folder / "capture.json").write_text(json.dumps(manifest))
+    edit_manifest(folder, frames=lambda frames: frames[:-1])
     fewer = relit("view", folder, "--maps", tmp_path / "maps", "--out", tmp_path / "fewer")
     fewer.refused("the maps come from a solve that has found the lights of")

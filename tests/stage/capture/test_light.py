@@ -199,16 +199,14 @@ def test_a_perspective_camera(folder):
     assert len(check_solvable(Capture.open(folder)).place) == 4
 
 
-def test_a_sign_turned_round_is_seen(folder):
+@pytest.mark.parametrize(("moved", "words"), [
+    (lambda way: [10 * way[0] + 1, way[1], -0.2], "0 of 4 lights lie in front of the surface (z = 0.02 m, +z is"),
+    (lambda way: 0.0002 * way + [0, 0, 0.3], "frames[].light.position_m: the near lights lie within 0.00017 m, and the object is"),
+], ids=["a sign turned round", "another unit"])
+def test_lights_at_impossible_places_are_refused(folder, moved, words):
     for index, way in enumerate(ring(4)):
-        edit_frame(folder, index, light=point([10 * way[0] + 1, way[1], -0.2]))
-    assert "0 of 4 lights lie in front of the surface (z = 0.02 m, +z is" in refused(folder)
-
-
-def test_lights_as_close_together_as_another_unit_makes_them(folder):
-    for index, way in enumerate(ring(4)):
-        edit_frame(folder, index, light=point(0.0002 * way + [0, 0, 0.3]))
-    assert "frames[].light.position_m: the near lights lie within 0.00017 m, and the object is" in refused(folder)
+        edit_frame(folder, index, light=point(moved(way)))
+    assert words in refused(folder)
 
 
 def test_what_distant_lights_are_refused_for(folder):

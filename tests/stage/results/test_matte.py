@@ -8,6 +8,7 @@ from stage.capture.capture import Capture
 from stage.results.matte import Matte, MatteSource, matte_of
 from stage.stack.ingest import open_stack
 from tests.marks import first_short
+from tests.scenes.captures import edit_manifest
 from tests.scenes.coverage import Covered, render_covered, write_covered
 
 
@@ -157,8 +158,7 @@ def test_masks_at_their_limits(tmp_path, shape):
         mask[:] = True
     folder = write_covered(tmp_path, scene, mask)
     if shape == "no mask":
-        text = (folder / "capture.json").read_text().replace('"mask": "mask.png", ', "")
-        (folder / "capture.json").write_text(text)
+        edit_manifest(folder, mask=None)
     capture = Capture.open(folder)
     matte = matte_of(capture, open_stack(capture))
     assert np.isfinite(matte.coverage).all() and matte.coverage.min() >= 0 and matte.coverage.max() <= 1

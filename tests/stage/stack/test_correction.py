@@ -11,6 +11,7 @@ from stage.errors import ImageError
 from stage.stack.brackets import merge_brackets, one_frame_a_light
 from stage.stack.correction import CodedRadiance, Correction, Radiance
 from stage.stack.ingest import open_stack
+from tests.reference.colour import srgb_to_linear
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, manifest_of, write_capture, write_exr, write_image, write_manifest
 
 SCENE = make_scene(size=8, lights=4)
@@ -153,8 +154,7 @@ def test_display_encoded_frames_are_linearised_dark_and_all(tmp_path):
         write_image(tmp_path / f"{name}.png", values)
     data = manifest_of(SCENE, color_space="srgb_texture", mask=None, dark="dark.png")
     write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png"}]})
-    linear = {name: np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4) for name, v in
-              ((name, values / 255.0) for name, values in codes.items())}
+    linear = {name: srgb_to_linear(values / 255) for name, values in codes.items()}
     # OpenColorIO's curve is 3e-4 off IEC's at most (tests/stage/colour/test_radiance.py)
     assert np.allclose(corrected(tmp_path).pixels, linear["000"] - linear["dark"], rtol=1e-3, atol=1e-5)
 

@@ -7,7 +7,7 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.basis.rti import encode
 from tests.kernels.scenes import store
-from tests.reference.light_basis import srgb
+from tests.reference.colour import srgb
 
 MATRIX = np.array([[1.7, -0.6, -0.1], [-0.1, 1.1, 0.0], [0.0, -0.1, 1.1]])
 HALF_STEP = 2.0**-12

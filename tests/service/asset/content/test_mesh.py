@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from service.asset.content.depth import depth_mesh
 from service.asset.content.links import Links, surface_links
@@ -225,11 +227,6 @@ def test_heights_that_are_no_place_get_no_vertex():
     assert np.isfinite(mesh.points).all()
 
 
-def test_no_height_is_an_error(ball):
-    with pytest.raises(AssetError, match="no height layer"):
-        height_mesh(dataclasses.replace(ball, height=None))
-
-
 @pytest.mark.parametrize("mask", [np.zeros((4, 4)), np.eye(4), np.ones((1, 1)), np.ones((1, 5))],
                          ids=["empty", "diagonal", "1x1", "one row"])
 def test_no_face_is_an_error(mask):
@@ -250,20 +247,8 @@ def scene(inside):
 
 def pieces(mesh):
     """The number of the piece of each vertex."""
-    label = np.arange(len(mesh.points))
-    faces = [*mesh.quads.T, *mesh.triangles.T]
-    pairs = [(mesh.quads[:, i], mesh.quads[:, (i + 1) % 4]) for i in range(4)] + [(mesh.triangles[:, i], mesh.triangles[:, (i + 1) % 3])
-                                                                                  for i in range(3)]
-    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    assert faces
-    while True:
-        least = np.minimum(label[first], label[second])
-        before = label.copy()
-        np.minimum.at(label, first, least)
-        np.minimum.at(label, second, least)
-        label = label[label]
-        if (label == before).all():
-            return label
+    edges = np.concatenate([np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2) for faces in (mesh.quads, mesh.triangles)])
+    return connected_components(coo_array((np.ones(len(edges)), edges.T), shape=2 * (len(mesh.points),)), directed=False)[1]
 
 
 @pytest.mark.parametrize("inside", [

@@ -214,13 +214,6 @@ def test_a_depth_becomes_a_glb(geometry, mode, tmp_path):
     assert read_glb(exported.path).document.meshes[0].primitives[0].mode == mode
 
 
-def test_an_unknown_suffix_names_the_known(tmp_path):
-    make_ball().write(tmp_path / "maps.exr")
-    with pytest.raises(AssetError, match=r"\.usda, \.usdc or \.usdz for USD, or \.glb for glTF"):
-        export(ExportRequest(maps=tmp_path, out=tmp_path / "a.gltf"))
-    assert [path.name for path in tmp_path.iterdir()] == ["maps.exr"]
-
-
 @pytest.mark.parametrize("name, value, sentence", [
     ("POSITION", np.float32(np.nan), "1 of its [0-9]+ values of POSITION are not finite"),
     ("TEXCOORD_0", np.float32(np.inf), "1 of its [0-9]+ values of TEXCOORD_0 are not finite"),

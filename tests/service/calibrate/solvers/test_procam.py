@@ -98,8 +98,7 @@ def fine_rays(device, oversample):
 def board_image(pose, device=CAMERA, oversample=3):
     """Radiance of the board, and the projector's coordinates at each pixel centre."""
     rays = fine_rays(device, oversample)
-    normal = pose[:3, 2]
-    own = (rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None] - pose[:3, 3]) @ pose[:3, :3]
+    own = (rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None] - pose[:3, 3]) @ pose[:3, :3]
     across, down = own[..., 0] / SQUARE + (BOARD[0] + 1) / 2, -own[..., 1] / SQUARE + (BOARD[1] + 1) / 2
     inside = (across > -1) & (across < BOARD[0] + 2) & (down > -1) & (down < BOARD[1] + 2)
     squares = (across > 0) & (across < BOARD[0] + 1) & (down > 0) & (down < BOARD[1] + 1)
@@ -123,8 +122,7 @@ def test_projector_corners_from_quantised_coordinates():
     pose = next(poses(1))
     corners = reference.project(CAMERA, corners_of(pose))
     rays = reference.pixel_rays(CAMERA)
-    normal = pose[:3, 2]
-    points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+    points = rays * reference.plane_depth(rays, pose[:3, 3], pose[:3, 2])[..., None]
     uv = np.floor(reference.seen_by(PROJECTOR, POSE, points)) + 0.5  # a Gray code's stripe centres
     decoded = np.random.default_rng(0).random(uv.shape[:2]) < 0.6
     uv[np.random.default_rng(1).random(uv.shape[:2]) < 0.02] += 64  # wrong bits

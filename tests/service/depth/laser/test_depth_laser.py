@@ -1,6 +1,5 @@
 """relit depth on laser frames: spots, stripes and sweeps of a known scene."""
 
-import json
 import re
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from kernels.status import Status
 from stage.formats.ply import read_ply
-from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_frame, files_in
 from tests.scenes.depth import CENTRE, NORMAL, PLANE, RADIUS, make_scene, write_lasers
@@ -30,9 +28,8 @@ def plane(x, *, upright=True):
 
 
 def solve(relit, folder, *arguments):
-    relit.done("depth", folder, "--out", folder / "out", *arguments)
-    return (DepthMaps.read(folder / "out" / "depth.exr"), read_ply(folder / "out" / "points.ply").points,
-            json.loads((folder / "out" / "report.json").read_text()))
+    maps, report, _ = relit.depth(folder, *arguments)
+    return maps, read_ply(folder / "out" / "points.ply").points, report
 
 
 def off_surface(points):
@@ -209,9 +206,7 @@ def test_a_second_plane_in_one_frame_takes_that_frame_out(relit, tmp_path):
     others = [plane(0.03) if number == 4 else None for number in range(12)]
     write_lasers(tmp_path, make_scene(sphere=False, camera=CAMERA), planes, width=1.2e-3, noise=0.003, camera=CAMERA, undeclared=others,
                  strength=0.8)
-    relit.done("depth", tmp_path, "--out", tmp_path / "out")
-    maps = DepthMaps.read(tmp_path / "out" / "depth.exr", unsure=True)
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    maps, report, _ = relit.depth(tmp_path, unsure=True)
     truth = make_scene(sphere=False, camera=CAMERA).depth
     doubtful = maps.status == Status.MULTIPATH
     assert doubtful.sum() > 150 and (maps.depth[doubtful] > 0).all() and not maps.mask[doubtful].any()

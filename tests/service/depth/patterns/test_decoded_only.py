@@ -92,8 +92,7 @@ def test_coordinates_are_the_result_where_no_pixel_has_a_depth(relit, tmp_path):
     """The pose in the manifest is that of a projector that is turned away: the planes of its columns meet no line of sight in front."""
     write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
     pose = reference.look_at((0.3, 0.08, 0.02), (1.2, 0.0, -1.4))
-    edit_manifest(tmp_path, projector={**json.loads((tmp_path / "capture.json").read_text())["projector"],
-                                       "camera_from_projector": pose.tolist()})
+    edit_manifest(tmp_path, projector=lambda projector: {**projector, "camera_from_projector": pose.tolist()})
     channels, report, said = decode(relit, tmp_path)
     mask = channels["mask.Y"] > 0.5
     assert mask[LIT].mean() > 0.97 and np.abs(channels["projector.U"] - SCENE.uv[..., 0])[mask].max() < 0.1
@@ -107,9 +106,8 @@ def test_coordinates_are_the_result_where_no_pixel_has_a_depth(relit, tmp_path):
 def test_frames_that_are_declared_wrongly_are_named_and_nothing_is_believed(relit, tmp_path, change, words):
     patterns = [*gray_patterns("column"), *gray_patterns("row")]
     write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], projector=SIZE)
-    frames = json.loads((tmp_path / "capture.json").read_text())["frames"]
-    edit_manifest(tmp_path, frames=[{**frame, "pattern": change(frame["pattern"]) if "axis" in frame["pattern"] else frame["pattern"]}
-                                    for frame in frames])
+    edit_manifest(tmp_path, frames=lambda frames: [
+        {**frame, "pattern": change(frame["pattern"]) if "axis" in frame["pattern"] else frame["pattern"]} for frame in frames])
     channels, report, said = decode(relit, tmp_path, code=1)
     assert words in said and any(words in sentence for sentence in report["warnings"])
     assert not channels["mask.Y"].any() and channels["confidence.Y"].max() < 0.11

@@ -1,19 +1,17 @@
 """relit depth on patterns that are bent, scattered, mirrored or declared wrongly: a right depth, a low confidence, or a sentence."""
 
-import json
 import re
 
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
 from kernels.status import Status
 from stage.patterns.base import uniform_patterns
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from stage.patterns.ramp import ramp_patterns
-from stage.results.depth_maps import DepthMaps
+from tests.scenes.projected import Ball, Rig, Wall, World, trace, write_capture
 
 RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)
 ROOM = World(shapes=(Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.4), Ball((0.12, -0.05, -1.2), 0.16, 0.8)), rig=RIG)
@@ -26,12 +24,6 @@ GAMMA = (np.linspace(0, 1, 256) ** 2.2).tolist()
 def light():
     """The light of the room, which every capture of it shares."""
     return trace(ROOM)
-
-
-def solve(relit, folder, *arguments):
-    outcome = relit("depth", folder, "--out", folder / "out", "--device", "cpu", *arguments)
-    assert outcome.code in (0, 1), outcome.err  # 1: nothing is sure
-    return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text()), outcome.out
 
 
 def bent(light, **changes):
@@ -48,7 +40,7 @@ PHASES = {"three periods": phase_patterns("column", (16, 18, 21), 3),
 @pytest.mark.parametrize("name", PHASES)
 def test_the_response_is_taken_off_waves(relit, tmp_path, light, name):
     write_capture(tmp_path, bent(light), PHASES[name], light=light, response=GAMMA)
-    maps, report, _ = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path, code=None, unsure=True)
     error = np.abs(maps.depth - light.depth)[maps.mask]
     assert report["warnings"] == []
     assert maps.mask[light.lit].mean() > 0.6
@@ -60,7 +52,7 @@ def test_the_response_is_taken_off_waves(relit, tmp_path, light, name):
 def test_bent_waves_are_found(relit, tmp_path, light, name):
     """Without the response σ holds the error, and a sentence says what to measure; a linear projector gives no sentence."""
     write_capture(tmp_path / "bent", bent(light), PHASES[name], light=light)
-    maps, report, out = solve(relit, tmp_path / "bent", "--least-confidence", "0")
+    maps, report, out = relit.depth(tmp_path / "bent", "--least-confidence", "0", code=None, unsure=True)
     error = np.abs(maps.depth - light.depth)[maps.mask]
     assert "relit calibrate response" in report["warnings"][0] and "projector.response" in out
     # where several periods are made to agree, the exponent takes over what the pixels' footprint rounds off the waves; without white it is
@@ -69,12 +61,12 @@ def test_bent_waves_are_found(relit, tmp_path, light, name):
     assert seen == pytest.approx(2.2, abs={"three periods": 0.25, "micro": 0.45}.get(name, 0.05))
     assert (error > 5 * maps.sigma[maps.mask]).mean() < 0.03
     write_capture(tmp_path / "linear", ROOM, PHASES[name], light=light)
-    assert solve(relit, tmp_path / "linear")[1]["warnings"] == []
+    assert relit.depth(tmp_path / "linear").report["warnings"] == []
 
 
 def test_the_response_is_taken_off_digits(relit, tmp_path, light):
     write_capture(tmp_path, bent(light), kary_patterns(WIDTH, "column", base=3, stripe_px=2), light=light, response=GAMMA)
-    maps, *_ = solve(relit, tmp_path)
+    maps, *_ = relit.depth(tmp_path, code=None, unsure=True)
     assert maps.mask[light.lit].mean() > 0.6  # the others are undecided, and no answer is wrong
     assert (np.abs(maps.depth - light.depth)[maps.mask] > 5 * maps.sigma[maps.mask]).mean() < 0.01
 
@@ -83,7 +75,7 @@ def test_the_response_is_taken_off_digits(relit, tmp_path, light):
 def test_fog_is_no_surface(relit, tmp_path):
     """What shines through may be solved, and is right; the rest is kept beside it, and a sentence says why."""
     light = write_capture(tmp_path, World(shapes=ROOM.shapes, rig=RIG, fog=0.8, light=1.5, samples=2), GRAY)
-    maps, report, _ = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path, code=None, unsure=True)
     assert (maps.mask & (np.abs(maps.depth - light.depth) > 5 * maps.sigma)).mean() < 0.002
     scattered = maps.status == Status.MULTIPATH
     assert scattered.mean() > 0.3 and (maps.depth[scattered] != 0).mean() > 0.5
@@ -97,7 +89,7 @@ def test_a_mirror_is_doubted(relit, tmp_path):
                                        Ball((0.0, -0.1, -1.2), 0.16, mirror=True)))
     patterns = (*phase_patterns("column", (16,), 4), *binary_patterns(320, "column", stripe_px=8))
     light = write_capture(tmp_path, mirrors, patterns)
-    maps, *_ = solve(relit, tmp_path)
+    maps, *_ = relit.depth(tmp_path, code=None, unsure=True)
     known = np.isfinite(light.depth)
     wrong = known & (np.abs(maps.depth - light.depth) > 0.02 * light.depth) & np.isin(maps.status, [Status.OK, Status.UNSURE])
     doubted = maps.status == Status.UNSURE
@@ -127,9 +119,9 @@ WAVES = (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())
 ])
 def test_a_wrong_declaration_is_named(relit, tmp_path, light, patterns, declared, words):
     write_capture(tmp_path, ROOM, patterns, light=light, declared=declared)
-    maps, *_ = solve(relit, tmp_path)
+    maps, *_ = relit.depth(tmp_path, code=None, unsure=True)
     assert not maps.mask.any()
-    maps, report, _ = solve(relit, tmp_path, "--least-confidence", "0")
+    maps, report, _ = relit.depth(tmp_path, "--least-confidence", "0", code=None, unsure=True)
     assert words in report["warnings"][0]
     assert np.percentile(maps.confidence[maps.mask], 99) < 0.2
 
@@ -139,7 +131,7 @@ def test_most_pixels_refused_is_said(relit, tmp_path, light):
     """A projector of another focal length than declared: columns and rows contradict each other."""
     patterns = (*binary_patterns(WIDTH, "column", references=False), *binary_patterns(RIG.projector[1], "row"))
     write_capture(tmp_path, ROOM, patterns, light=light, focal_px=[2 * RIG.projector_focal] * 2)
-    maps, report, _ = solve(relit, tmp_path)
+    maps, report, _ = relit.depth(tmp_path, code=None, unsure=True)
     assert any("lit pixels have a depth that can be trusted; most of the" in sentence for sentence in report["warnings"])
     assert not maps.mask.any() and maps.confidence.max() < 0.2  # those whose lines of sight meet do so by chance
 
@@ -149,7 +141,7 @@ def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):
     frame early."""
     noisy = World(shapes=ROOM.shapes, rig=RIG, read_noise=0.012, electrons=2000.0)
     write_capture(tmp_path, noisy, ramp_patterns("column"), light=light)
-    _, report, out = solve(relit, tmp_path, "--read-noise", 0.012, "--photon-gain", 1 / 2000)
+    _, report, out = relit.depth(tmp_path, "--read-noise", 0.012, "--photon-gain", 1 / 2000, code=None, unsure=True)
     assert "as declared" not in out and report["pixels"]["ok"] > 0
 
 
@@ -158,7 +150,7 @@ def test_noisy_ramps_are_not_taken_for_another_order(relit, tmp_path, light):
                                       (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False))])
 def test_right_captures_raise_no_alarm(relit, tmp_path, light, patterns):
     write_capture(tmp_path, ROOM, patterns, light=light)
-    maps, report, out = solve(relit, tmp_path)
+    maps, report, out = relit.depth(tmp_path, code=None, unsure=True)
     assert report["warnings"] == [] and "warning" not in out
     error = np.abs(maps.depth - light.depth)[maps.mask]
     assert maps.mask[light.lit].mean() > 0.85 and (maps.status == Status.UNSURE).mean() < 0.02

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
 from tests.scenes.depth import depth_of
+from tests.scenes.projected import Rig, Wall, World, trace, write_capture
 
 RIG = Rig(camera=(150, 80), camera_focal=195.0, projector=(256, 144), projector_focal=330.0)
 PIXEL = 1.0 / RIG.camera_focal

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from stage.results.depth_maps import DepthMaps
 from tests.scenes.captures import edit_manifest
 from tests.scenes.depth import BLACK_WHITE, POSE, PROJECTOR, entries_of, entry_of, gray_patterns, make_scene, phase_patterns, write_patterns
 
@@ -16,8 +15,8 @@ def measured(relit, folder, **changes):
     """The depth and the warnings under a projector that is declared with changes."""
     projector = {**entry_of(PROJECTOR), "camera_from_projector": POSE.tolist()} | changes
     edit_manifest(folder, projector={name: value for name, value in projector.items() if value is not None})
-    relit("depth", folder, "--out", folder / "out", "--device", "cpu")
-    return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())["warnings"]
+    maps, report, _ = relit.depth(folder, "--device", "cpu", code=None)
+    return maps, report["warnings"]
 
 
 @pytest.fixture

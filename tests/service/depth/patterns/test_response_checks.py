@@ -4,11 +4,11 @@ white and black together, of whose depths none is believed. A sentence says so, 
 import numpy as np
 import pytest
 
-from benchmarks import projected_scenes
-from benchmarks.projected_scenes import Ball, Wall, World
 from stage.patterns.ramp import ramp_patterns
 from tests.marks import first_short
+from tests.scenes import projected
 from tests.scenes.depth import AMBIENT, PROJECTOR, depth_of, depth_under, grey_light, make_scene, phase_patterns
+from tests.scenes.projected import Ball, Wall, World
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,9 @@ FAULTS = {
 
 def under_ramps(folder, monkeypatch, change=lambda frames: frames, *, gamma=1.0, **projector):
     """|error| / σ of the solved depths and what is said, of a wall and a ball under two ramps, white and black."""
-    world, plain = World(shapes=SHAPES, gamma=gamma, samples=2), projected_scenes.images
-    monkeypatch.setattr(projected_scenes, "images", lambda *args: change(plain(*args)))
-    truth = projected_scenes.write_capture(folder / "capture", world, ramp_patterns("column"), **projector).depth
+    world, plain = World(shapes=SHAPES, gamma=gamma, samples=2), projected.images
+    monkeypatch.setattr(projected, "images", lambda *args: change(plain(*args)))
+    truth = projected.write_capture(folder / "capture", world, ramp_patterns("column"), **projector).depth
     found = depth_of(folder / "capture", photon_gain=1 / world.electrons)
     maps = found.maps
     return (np.abs(maps.depth - truth) / np.maximum(maps.sigma, 1e-9))[maps.mask], "; ".join(found.warnings)

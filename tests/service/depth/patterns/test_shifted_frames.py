@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns
 from tests.marks import first_short
 from tests.scenes.depth import depth_of
+from tests.scenes.projected import Ball, Rig, Wall, World, trace, write_capture
 
 RIG = Rig(camera=(200, 150), camera_focal=230.0, projector=(256, 192), projector_focal=300.0)
 WORLD = World(shapes=(Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.1, 0.05, -1.2), 0.13, 0.8, texture=0.3),

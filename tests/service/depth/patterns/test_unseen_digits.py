@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Wall, World, trace, write_capture
 from stage.patterns.binary import binary_patterns
 from stage.patterns.kary import kary_patterns, palette
 from tests.marks import first_short
 from tests.scenes.depth import depth_of
+from tests.scenes.projected import Ball, Wall, World, trace, write_capture
 
 SHAPES = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.05, -1.15), 0.12, 0.8))
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
 from kernels.status import Status
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import phase_patterns
 from tests.scenes.depth import depth_of
+from tests.scenes.projected import Ball, Rig, Wall, World, trace, write_capture
 
 pytestmark = pytest.mark.long
 

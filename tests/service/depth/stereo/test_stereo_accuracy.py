@@ -1,7 +1,6 @@
 """Depth of stereo against closed forms: σ, thin parts, noise, OpenCV's matcher on the same images, other rigs, and light frames of the
 same capture."""
 
-import json
 from functools import cache
 
 import cv2
@@ -16,11 +15,12 @@ from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest, write_exr
 from tests.scenes.depth import entry_of
-from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
-from tests.service.depth.stereo.test_stereo import pixels_off, solve
+from tests.scenes.projected import Ball, Wall, rectangle
+from tests.scenes.stereo import CAMERA, OTHER, POSE
+from tests.service.depth.stereo.test_stereo import pixels_off
 
 pytestmark = pytest.mark.long
-WALL, BALL = Plane((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Sphere((-0.06, 0.05, -0.88), 0.1, 0.55)
+WALL, BALL = Wall((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Ball((-0.06, 0.05, -0.88), 0.1, 0.55)
 ABOVE = np.eye(4)
 ABOVE[:3, 3] = (0.01, 0.1, 0.0)
 TO_THE_LEFT = reference.look_at((-0.11, -0.01, 0.004), (0.01, 0.0, -1.0))
@@ -45,7 +45,7 @@ def recorded(view, seed, **noise):
     (1, 3, {}), (3, 4, {"read": 0.008, "photons": 3000.0}), (2, 5, {"read": 0.001, "photons": 1e5})])
 def test_sigma_is_that_of_the_true_error(relit, tmp_path, textures, cell, noise):
     left, right = pair((WALL, BALL), textures, cell)
-    maps, _ = solve(relit, scenes.write_pair(tmp_path, recorded(left, 1, **noise), recorded(right, 2, **noise)))
+    maps, *_ = relit.depth(scenes.write_pair(tmp_path, recorded(left, 1, **noise), recorded(right, 2, **noise)))
     off = np.abs(maps.depth - left.depth)[maps.mask]
     right_ones = np.abs(pixels_off(maps, left.depth))[maps.mask] < 1
     inside = [float((off <= times * maps.sigma[maps.mask])[right_ones].mean()) for times in (1, 2)]
@@ -57,7 +57,7 @@ def test_sigma_is_that_of_the_true_error(relit, tmp_path, textures, cell, noise)
 def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
     left, right = pair((WALL, BALL))
     ours, theirs = recorded(left, 3), recorded(right, 4)
-    maps, _ = solve(relit, scenes.write_pair(tmp_path, ours, theirs))
+    maps, *_ = relit.depth(scenes.write_pair(tmp_path, ours, theirs))
     camera = Camera(projection="perspective", **entry_of(CAMERA))
     other = OtherCamera(name="right", **entry_of(OTHER), camera_from_other=POSE.tolist())
     geometry = rectify(camera, other, where="")
@@ -82,9 +82,9 @@ def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
 
 @pytest.mark.parametrize("textures", [1, 4])
 def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
-    bars = [Rectangle(x, (-0.3, 0.3), depth) for x, depth in (((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9))]
-    left, right = pair((Plane((0, 0, -1.15), (0.05, 0.1, 1)), *bars), textures)
-    maps, _ = solve(relit, scenes.write_pair(tmp_path, recorded(left, 5), recorded(right, 6)))
+    bars = [rectangle(x, (-0.3, 0.3), depth) for x, depth in (((-0.1, -0.095), 0.9), ((0.03, 0.045), 0.85), ((0.1, 0.14), 0.9))]
+    left, right = pair((Wall((0, 0, -1.15), (0.05, 0.1, 1), 0.6), *bars), textures)
+    maps, *_ = relit.depth(scenes.write_pair(tmp_path, recorded(left, 5), recorded(right, 6)))
     off = np.abs(pixels_off(maps, left.depth))
     for index, least in ((1, 0.0), (2, 0.0), (3, 0.5)):  # 2.3, 7.4 and 19 pixels wide
         inside = left.part == index
@@ -96,25 +96,24 @@ def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
 @pytest.mark.parametrize("pose", [ABOVE, TO_THE_LEFT], ids=["above", "to the left"])
 def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
     left, right = pair((WALL, BALL), 1, 3, pose)
-    maps, _ = solve(relit, scenes.write_pair(tmp_path, recorded(left, 7), recorded(right, 8), pose=pose))
+    maps, *_ = relit.depth(scenes.write_pair(tmp_path, recorded(left, 7), recorded(right, 8), pose=pose))
     off = np.abs(pixels_off(maps, left.depth, pose))
     assert maps.mask.mean() > 0.65 and (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
     assert np.sqrt(np.mean(off[maps.mask & (off < 1)] ** 2)) < 0.1
 
 
 def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
-    parts = Plane((0, 0, -1.2), (0.1, 0.05, 1)), Rectangle((-0.1, 0.05), (-0.12, 0.1), 0.85)
+    parts = Wall((0, 0, -1.2), (0.1, 0.05, 1), 0.6), rectangle((-0.1, 0.05), (-0.12, 0.1), 0.85)
     left, right = pair(parts)
     _, third = pair(parts, 1, 3, TO_THE_LEFT)
     folder = scenes.write_pair(tmp_path / "two", recorded(left, 9), recorded(right, 10))
-    two, _ = solve(relit, folder)
+    two, *_ = relit.depth(folder)
     folder = scenes.write_pair(tmp_path / "three", recorded(left, 9), recorded(right, 10))
-    data = json.loads((folder / "capture.json").read_text())
     further = {"name": "left", **entry_of(OTHER), "camera_from_other": TO_THE_LEFT.tolist()}
     scenes.write_image(folder / "far_0.png", recorded(third, 11)[0])
-    edit_manifest(folder, other_cameras=[*data["other_cameras"], further],
+    edit_manifest(folder, other_cameras=lambda others: [*others, further],
                   frames=[{"image": "left_0.png", "stereo": {"images": ["right_0.png", "far_0.png"]}}])
-    three, report = solve(relit, folder)
+    three, report, _ = relit.depth(folder)
     assert [camera["name"] for camera in report["found"]["cameras"]] == ["right", "left"]
     gained = three.mask & (two.status == Status.OCCLUDED)
     assert gained.sum() > 0.4 * (two.status == Status.OCCLUDED).sum()
@@ -128,7 +127,7 @@ def test_a_third_camera_sees_what_the_second_does_not(relit, tmp_path):
 def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
     """Texture and lights in one capture: `solve`, `depth` and `join` speak of the same pixels."""
     left, right = pair((WALL, BALL), 3)
-    normal = np.where((left.part == 1)[..., None], (left.points - BALL.centre) / BALL.radius, WALL.normal / np.linalg.norm(WALL.normal))
+    normal = np.where((left.part == 1)[..., None], (left.points - BALL.center_m) / BALL.radius_m, WALL.normal / np.linalg.norm(WALL.normal))
     directions = [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0, -0.5, 1), (0.35, 0.35, 1)]
     further = []
     for index, direction in enumerate(np.array(directions) / np.linalg.norm(directions, axis=1, keepdims=True)):
@@ -137,7 +136,7 @@ def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
         write_exr(tmp_path / f"olat_{index}.exr", np.repeat(lit[..., None], 3, axis=-1))
         further.append({"image": f"olat_{index}.exr", "light": light})
     scenes.write_pair(tmp_path, recorded(left, 12), recorded(right, 13), further=further)
-    maps, _ = solve(relit, tmp_path)
+    maps, *_ = relit.depth(tmp_path)
     assert relit("solve", tmp_path, "--method", "lambert", "--out", tmp_path / "solved").code == 0
     solved = SurfaceMaps.read(tmp_path / "solved" / "maps.exr")
     assert solved.camera.resolution == maps.camera.resolution and solved.camera.focal_px == maps.camera.focal_px
@@ -156,9 +155,9 @@ def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
 def test_bands_of_rows_agree_with_the_whole_image(relit, tmp_path, monkeypatch):
     left, right = pair((WALL, BALL))
     folder = scenes.write_pair(tmp_path, recorded(left, 14), recorded(right, 15))
-    whole, _ = solve(relit, folder)
+    whole, *_ = relit.depth(folder)
     monkeypatch.setattr("service.depth.stereo.stereo_pair.VOLUME_BYTES", 1 << 20)  # the fewest rows at a time
-    banded, _ = solve(relit, folder)
+    banded, *_ = relit.depth(folder)
     # paths that begin 24 rows above a band choose what those that begin at the top choose, but for single pixels at edges
     assert (whole.mask != banded.mask).mean() < 0.01
     both = whole.mask & banded.mask

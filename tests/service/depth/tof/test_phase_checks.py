@@ -4,7 +4,6 @@ noise are those of tests/reference/tof.py."""
 import numpy as np
 import pytest
 
-from tests.marks import first_short
 from tests.reference import tof
 from tests.scenes.depth import depth_of
 from tests.scenes.tof import cw_frames, write
@@ -58,12 +57,22 @@ def under(hz=HZ, phases=4, **more):
     return tof.correlations(VIEW, 2e5, settings, ambient=30, seed=3, **more), settings
 
 
-@pytest.mark.parametrize(("hz", "phases"), [(HZ, 4), (HZ, 3), ((30e6, 70e6), 4), ((12e6,), 4)])
-def test_phases_that_are_declared_backwards_are_named(tmp_path, hz, phases):
+def backwards(hz, delta):
+    return hz, -delta % (2 * np.pi)
+
+
+@pytest.mark.parametrize(("hz", "phases", "declared", "words"), [
+    *((hz, phases, backwards, "phases ran backwards") for hz, phases in ((HZ, 4), (HZ, 3), ((30e6, 70e6), 4), ((12e6,), 4))),
+    (HZ, 4, lambda hz, delta: backwards(hz, delta) if hz == 50e6 else (hz, delta), "the phases of 50 MHz run backwards"),
+    (HZ, 4, lambda hz, delta: (hz, (delta - np.pi / 2) % (2 * np.pi)), "reference_phase_rad is a quarter of a turn more"),
+    (HZ, 4, lambda hz, delta: ({50e6: 52e6}.get(hz, hz), delta), "52 MHz are 50 MHz"),
+    *(pytest.param(HZ, 4, lambda hz, delta, told=told: (told.get(hz, hz), delta), words, marks=pytest.mark.long) for told, words in (
+        ({60e6: 57e6}, "57 MHz are 60 MHz"), ({20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"))),
+], ids=["backwards", "three phases", "two frequencies", "one", "one of three", "a quarter aside", "52 MHz", "57 MHz", "exchanged"])
+def test_a_wrong_declaration_is_named(tmp_path, hz, phases, declared, words):
     images, settings = under(hz, phases)
-    result = measured(tmp_path, images, [(f, -delta % (2 * np.pi)) for f, delta in settings])
-    assert not result.maps.mask.any()
-    assert "phases ran backwards" in result.warnings[0]
+    result = measured(tmp_path, images, [declared(*setting) for setting in settings])
+    assert not result.maps.mask.any() and words in result.warnings[0]
 
 
 @pytest.mark.parametrize("hz", [HZ, (60e6,)], ids=["three", "one"])
@@ -73,27 +82,9 @@ def test_planes_with_texture_tell_that_phases_run_backwards(tmp_path, hz):
     images = tof.correlations(textured(curved=False), 2e5, settings, ambient=30, seed=3)
     right = measured(tmp_path / "right", images, settings)
     assert not right.warnings and right.maps.mask.mean() > 0.95
-    result = measured(tmp_path / "backwards", images, [(f, -delta % (2 * np.pi)) for f, delta in settings])
+    result = measured(tmp_path / "backwards", images, [backwards(*setting) for setting in settings])
     assert not result.maps.mask.any()
     assert "plane if the phases run backwards" in result.warnings[0]
-
-
-@first_short(("declared", "words"), [
-    ({50e6: 52e6}, "52 MHz are 50 MHz"),
-    ({60e6: 57e6}, "57 MHz are 60 MHz"),
-    ({20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"),
-])
-def test_frequencies_that_are_declared_wrongly_are_named(tmp_path, declared, words):
-    images, settings = under()
-    result = measured(tmp_path, images, [(declared.get(hz, hz), delta) for hz, delta in settings])
-    assert not result.maps.mask.any()
-    assert words in result.warnings[0]
-
-
-def test_images_that_begin_at_another_phase_are_named(tmp_path):
-    images, settings = under()
-    result = measured(tmp_path, images, [(hz, (delta - np.pi / 2) % (2 * np.pi)) for hz, delta in settings])
-    assert not result.maps.mask.any() and "reference_phase_rad is a quarter of a turn more" in result.warnings[0]
 
 
 @pytest.mark.parametrize("hz", [HZ, (12e6,)], ids=["three", "one"])
@@ -107,13 +98,6 @@ def test_readings_that_stop_at_one_level_are_saturated(tmp_path, hz):
     assert clipped.maps.mask.mean() > 0.5 and (off > 5).mean() < 0.02
     even = tof.View(np.full((ROWS, COLS), 1.3), np.full((ROWS, COLS), 0.5), np.ones((ROWS, COLS)))
     assert not any("full" in said for said in measured(tmp_path / "even", tof.correlations(even, 2e5, settings), settings).warnings)
-
-
-def test_one_frequency_that_runs_backwards_is_named(tmp_path):
-    images, settings = under()
-    result = measured(tmp_path, images, [(hz, -delta % (2 * np.pi) if hz == 50e6 else delta) for hz, delta in settings])
-    assert not result.maps.mask.any()
-    assert "the phases of 50 MHz run backwards" in result.warnings[0]
 
 
 def test_fog_is_not_believed(tmp_path):

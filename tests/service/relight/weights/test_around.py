@@ -8,8 +8,8 @@ from scipy.spatial import ConvexHull
 
 from service.relight.weights.triangulation import left_out, lights_around
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
+from tests.reference.relight import shares_among
 from tests.reference.sampling import lattice
-from tests.reference.shading import shares_around
 
 
 def geodesic():
@@ -55,7 +55,7 @@ def test_shares_are_parts_of_one(direction):
 def test_shares_are_those_of_the_delaunay_triangle(direction):
     samples = scattered(500, 1)
     got = weighted(direction, *lights_around(direction, samples))
-    np.testing.assert_allclose(got, shares_around(direction, samples), atol=SHARE)
+    np.testing.assert_allclose(got, shares_among(direction)(samples), atol=SHARE)
 
 
 def test_inside_a_dome_too():

@@ -9,6 +9,7 @@ from service.scans.fusion.fuse import fuse
 from stage.capture.camera import Camera
 from stage.formats.images import read_pixels
 from stage.results.maps import SurfaceMaps
+from tests.clients.validators import findings
 from tests.scenes.in_front import gradient, unit
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
@@ -103,7 +104,5 @@ def test_roughness_and_specular_arrive_as_they_were(asset):
     assert len(point) > FACES / 4
 
 
-def test_nvidia_validator_finds_no_failure(asset):
-    nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
-    issues = nvidia.ValidationEngine().validate(str(asset.asset_path)).issues()
-    assert [(str(issue.severity), issue.message) for issue in issues] == []
+def test_validators_find_nothing(asset):
+    assert findings(asset.asset_path) == []

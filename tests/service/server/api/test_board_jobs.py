@@ -12,7 +12,8 @@ from stage.results.depth_maps import DepthMaps
 from tests.scenes import stereo as scenes
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
-from tests.scenes.stereo import POSE, Plane
+from tests.scenes.projected import Wall
+from tests.scenes.stereo import POSE
 from tests.service.calibrate.test_procam import write_board
 from tests.service.depth.stereo.test_two_cameras import two_captures
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
@@ -148,7 +149,7 @@ def test_a_board_calibrates_cameras_as_the_command_does(server, client, tmp_path
 
 @pytest.mark.long
 def test_depth_of_two_cameras(server, client, tmp_path):
-    parts, texture = [Plane((0, 0, -1.1), (0.2, 0.1, 1))], [scenes.dots(7)]
+    parts, texture = [Wall((0, 0, -1.1), (0.2, 0.1, 1), 0.6)], [scenes.dots(7)]
     rng = np.random.default_rng(0)
     pair = [[scenes.recorded(scenes.render(parts, texture, *camera, side=2).images[0], rng)] for camera in ((), (scenes.OTHER, POSE))]
     identifier = sent(server, client, scenes.write_pair(tmp_path / "pair", *pair))

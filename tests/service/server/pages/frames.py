@@ -7,6 +7,7 @@ import numpy as np
 
 from stage.colour.colour import rgb_matrix
 from stage.formats import exr
+from tests.reference.colour import srgb
 from tests.service.server.pages.conftest import Solved
 
 STEPS = 2 / 255
@@ -32,11 +33,6 @@ def picture(page) -> np.ndarray:
     return (found.reshape(side, side, 4)[..., :3] / 255).astype(np.float64)
 
 
-def encoded(linear: np.ndarray) -> np.ndarray:
-    clipped = np.clip(linear, 0, 1)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-
-
 def rendered(page, solved: Solved, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """The first frame of the batch that the page submits, encoded as the page does, and its coverage."""
     page.get_by_label("Frames", exact=True).last.fill("1")
@@ -46,7 +42,7 @@ def rendered(page, solved: Solved, folder: Path) -> tuple[np.ndarray, np.ndarray
     job = page.url.rpartition("/")[2]
     channels, metadata = exr.read(solved.result(job, "frame.0001.exr", folder))
     to_screen = rgb_matrix(exr.color_space_of(metadata), "lin_rec709_scene")
-    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32) @ to_screen.T), channels["A"]
+    return srgb(np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32) @ to_screen.T), channels["A"]
 
 
 def assert_same(shown: np.ndarray, frame: np.ndarray, coverage: np.ndarray) -> None:

@@ -40,8 +40,7 @@ def test_a_sound_service(relit, data, database, tmp_path, monkeypatch):
     workers.insert(database, "w1", host="h", pid=1, device="cuda:1")
     (tmp_path / "captures").mkdir()
     monkeypatch.setenv("RELIT_PROJECT_ROOTS", f"larch={tmp_path / 'captures'}")
-    outcome = relit("doctor", "--device", "cpu", "--data", data)
-    assert (outcome.code, outcome.err) == (0, ""), outcome.out
+    outcome = relit.done("doctor", "--device", "cpu", "--data", data)
     lines = lines_of(outcome)
     assert "dbos" in lines["service"] and "fastapi" in lines["service"]
     assert lines["storage"] == f"{data} can be written" and lines["database"] == f"{data / 'relit.sqlite'} answers"

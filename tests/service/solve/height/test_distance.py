@@ -1,11 +1,9 @@
 """The distance of a surface under near lights, which the manifest does not give: found with its σ, or refused."""
 
-import json
 
 import numpy as np
 import pytest
 
-from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest
 from tests.scenes.near_lights import lamps
@@ -14,6 +12,7 @@ DOME = near_lights.dome(40, perspective=True)
 FLAT = near_lights.dome(40)
 DEPTH = -DOME.camera["surface_z_m"]
 RNG = np.random.default_rng(3)
+ROBUST = "--method", "robust", "--device", "cpu"
 
 
 def capture(folder, lights, told=None, scene=DOME):
@@ -22,16 +21,11 @@ def capture(folder, lights, told=None, scene=DOME):
     return folder
 
 
-def solved(relit, folder, *options):
-    outcome = relit.done("solve", folder, "--out", folder / "out", "--method", "robust", "--device", "cpu", *options)
-    return outcome.out, json.loads((folder / "out" / "report.json").read_text()), SurfaceMaps.read(folder / "out" / "maps.exr")
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("radii", "count"), [(3.0, 8), (1.5, 16)])
 def test_the_distance_is_found(relit, tmp_path, radii, count):
     """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""
-    out, report, maps = solved(relit, capture(tmp_path / "c", lamps(DOME, count, radii)))
+    maps, report, out = relit.solve(capture(tmp_path / "c", lamps(DOME, count, radii)), *ROBUST)
     found = report["found"]["distance"]
     assert found["surface_z_m"] == pytest.approx(-DEPTH, rel=0.005)
     assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"] < 0.08 * DEPTH
@@ -47,7 +41,7 @@ def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
     lights = lamps(DOME, 12, 3.0)
     told = [lamp._replace(position=lamp.position + RNG.normal(0, 0.006, 3), strength=lamp.strength * np.exp(RNG.normal(0, 0.03)))
             for lamp in lights]
-    _, report, _ = solved(relit, capture(tmp_path / "c", lights, told))
+    report = relit.solve(capture(tmp_path / "c", lights, told), *ROBUST).report
     found = report["found"]["distance"]
     assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"]
 
@@ -56,7 +50,7 @@ def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
 def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path):
     """The dome stands 0.08 m before z = 0, which is the default; depths count from the nearest light."""
     lights = lamps(FLAT, 12, 6.0)
-    out, report, maps = solved(relit, capture(tmp_path / "c", lights, scene=FLAT))
+    maps, report, out = relit.solve(capture(tmp_path / "c", lights, scene=FLAT), *ROBUST)
     found, true = report["found"]["distance"], FLAT.camera["surface_z_m"]
     below = max(lamp.position[2] for lamp in lights) - true
     assert abs(found["surface_z_m"] - true) < min(2 * found["sigma_m"], 0.01 * below)
@@ -68,8 +62,7 @@ def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path):
 def test_an_orthographic_camera_keeps_its_default_where_images_do_not_tell(relit, tmp_path):
     lights = lamps(FLAT, 4, 3.0)
     folder = capture(tmp_path / "c", lights, scene=FLAT)  # at the wrong distance few or no pixels settle
-    out = relit("solve", folder, "--out", folder / "out", "--method", "robust", "--device", "cpu").out
-    report = json.loads((folder / "out" / "report.json").read_text())
+    _, report, out = relit.solve(folder, *ROBUST, code=None)
     assert "distance" not in report["found"]
     sentence = next(one for one in report["warnings"] if "surface_z_m" in one)
     assert "the images of 4 lights do not tell it" in sentence and "0 was taken, the default of an orthographic camera" in sentence

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stage.formats import exr
-from stage.results.maps import SurfaceMaps
 from tests.marks import first_short
 from tests.reference.sampling import lattice
 from tests.scenes.captures import angles_degrees, distant, edit_frame, edit_manifest, write_image, write_lit
@@ -55,22 +54,19 @@ def captures(tmp_path):
     return tmp_path
 
 
-def solve(relit, folder, *arguments):
-    return relit("solve", folder / "object", "--out", folder / "out", *arguments)
+def by_ball(relit, captures, *options, **more):
+    return relit.solve(captures / "object", "--method", "reference", "--reference-ball", captures / "ball", *options,
+                       out=captures / "out", **more)
 
 
 @pytest.mark.long
 def test_normals_of_a_material_without_a_model(relit, captures):
-    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball",
-                    "--cache", captures / "cache")
-    assert (outcome.code, outcome.err) == (0, "")
-    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
+    maps, *_ = by_ball(relit, captures, "--cache", captures / "cache")
     normal, mask = surface(SIDE, 0.6)
     error = angles_degrees(maps.normal, normal)[mask]
     assert np.array_equal(maps.mask, mask) and error.mean() < 0.3  # the pixels of the ball are 0.9 degrees apart
     assert error[normal[mask][:, 2] > 0.3].max() < 2  # its last pixel inside the rim is at 78 degrees
-    solve(relit, captures, "--method", "svbrdf")
-    by_model = angles_degrees(SurfaceMaps.read(captures / "out" / "maps.exr").normal, normal)[mask]
+    by_model = angles_degrees(relit.solve(captures / "object", "--method", "svbrdf", code=None).maps.normal, normal)[mask]
     assert by_model.mean() > 5 * error.mean()
 
 
@@ -84,12 +80,10 @@ def chrome(normal: np.ndarray) -> np.ndarray:
 @pytest.mark.long
 def test_a_ball_of_another_material_is_named_and_widens_sigma(relit, captures):
     write(captures / "ball", *surface(140, 1.0), 0.5, shade=chrome)
-    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
-    report = json.loads((captures / "out" / "report.json").read_text())
+    maps, report, said = by_ball(relit, captures, code=None)
     assert "the ball is of another material" in report["warnings"][0]
     assert report["found"]["reference"]["unexplained_over_noise"] > 2
-    assert "another material" in outcome.out
-    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
+    assert "another material" in said
     normal, mask = surface(SIDE, 0.6)
     error, sigma = angles_degrees(maps.normal, normal), maps.sigma
     assert error[mask].mean() > 10  # the wrong ball gives wrong normals
@@ -103,10 +97,8 @@ def test_a_ball_of_another_material_is_named_and_widens_sigma(relit, captures):
 def test_the_right_ball_raises_no_alarm_under_noise(relit, captures):
     for folder, shape in (("object", surface(SIDE, 0.6)), ("ball", surface(140, 1.0))):
         write(captures / folder, *shape, 0.5, noise=0.02)
-    solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
-    report = json.loads((captures / "out" / "report.json").read_text())
+    maps, report, _ = by_ball(relit, captures)
     assert report["warnings"] == [] and report["found"]["reference"]["unexplained_over_noise"] < 1.3
-    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
     normal, mask = surface(SIDE, 0.6)
     inner = mask & (normal[..., 2] > 0.3)  # further out the ball has no pixels
     ratio = angles_degrees(maps.normal, normal)[inner] / maps.sigma[inner]
@@ -116,10 +108,9 @@ def test_the_right_ball_raises_no_alarm_under_noise(relit, captures):
 
 @pytest.mark.long
 def test_what_is_not_estimated_is_absent(relit, captures):
-    solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
+    _, report, _ = by_ball(relit, captures)
     channels, _ = exr.read(captures / "out" / "maps.exr")
     assert {name.partition(".")[0] for name in channels} == {"normal", "height", "sigma", "confidence", "status", "mask"}
-    report = json.loads((captures / "out" / "report.json").read_text())
     assert report["found"]["reference"]["radius_px"] == pytest.approx(70 / 1.06, abs=0.5)
     assert report["options"]["reference_ball"] == str(captures / "ball")
     options = json.loads(exr.read_header(captures / "out" / "maps.exr").metadata["relit:options"])
@@ -129,8 +120,9 @@ def test_what_is_not_estimated_is_absent(relit, captures):
 
 @pytest.mark.parametrize("arguments", [("--method", "reference"), ("--reference-ball", "ball")])
 def test_method_and_ball_go_together(relit, captures, arguments):
-    outcome = solve(relit, captures, *(captures / a if a == "ball" else a for a in arguments))
-    assert outcome.code == 2 and "--method reference and --reference-ball CAPTURE go together" in outcome.err
+    words = (captures / word if word == "ball" else word for word in arguments)
+    said = relit.refused("solve", captures / "object", "--out", captures / "out", *words)
+    assert "--method reference and --reference-ball CAPTURE go together" in said
 
 
 FAULTS = {
@@ -149,6 +141,6 @@ FAULTS = {
 def test_what_is_no_reference_is_refused(relit, captures, fault):
     change, words = FAULTS[fault]
     change(captures / "ball")
-    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
-    assert outcome.code == 2 and not (captures / "out").exists()
-    assert words in " ".join(outcome.err.split())
+    assert words in relit.refused("solve", captures / "object", "--method", "reference", "--reference-ball", captures / "ball",
+                                  "--out", captures / "out")
+    assert not (captures / "out").exists()

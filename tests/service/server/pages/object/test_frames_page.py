@@ -9,9 +9,9 @@ import OpenImageIO as oiio
 import pytest
 
 from stage.formats import exr
+from tests.reference.colour import srgb
 from tests.service.server.api.job_calls import refused
 from tests.service.server.pages.conftest import done, expect
-from tests.service.server.pages.frames import encoded
 
 pytestmark = pytest.mark.long
 
@@ -64,7 +64,7 @@ def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved
     (tmp_path / "frame.jpg").write_bytes(io.BytesIO(answer.content).getvalue())
     shown = oiio.ImageBuf(str(tmp_path / "frame.jpg")).get_pixels(oiio.FLOAT)
     channels, _ = exr.read(solved.result(relit, "frame.0001.exr", tmp_path))
-    expected = encoded(np.stack([channels[each] for each in "RGB"], axis=-1).astype(np.float32)) + 0.2 * (1 - channels["A"][..., None])
+    expected = srgb(np.stack([channels[each] for each in "RGB"], axis=-1).astype(np.float32)) + 0.2 * (1 - channels["A"][..., None])
     assert shown.shape == expected.shape
     assert np.abs(shown - expected).mean() < 0.02  # JPEG, whose colour has half of the resolution
 

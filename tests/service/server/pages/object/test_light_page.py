@@ -9,9 +9,10 @@ import pytest
 from service.client import Client
 from stage.colour.colour import rgb_matrix
 from stage.formats import exr
+from tests.reference.colour import srgb
 from tests.scenes.captures import edit_manifest, write_exr
 from tests.service.server.pages.conftest import SAMPLES, Solved, done, expect, new_context, seen
-from tests.service.server.pages.frames import assert_same, encoded, picture, rendered
+from tests.service.server.pages.frames import assert_same, picture, rendered
 
 pytestmark = pytest.mark.long
 CAPTURED = 7
@@ -123,7 +124,7 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
         keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
         job = done(solved.server, client, {"kind": "relight", "capture": solved.capture, "keys": keys, "options": {"exposure": exposure}})
     channels, _ = exr.read(solved.result(job, "frame.0001.exr", tmp_path))
-    assert_same(shown, encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
+    assert_same(shown, srgb(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
 
 def test_without_webgl_it_is_said(browser, solved):

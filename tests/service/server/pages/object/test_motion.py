@@ -8,6 +8,7 @@ from docs.tools.view_table import FIRST, SIDE, STOPS, view_table
 from service.server.pages.routes import HOME
 from stage.colour.colour import through_view
 from stage.colour.colour_spaces import Review
+from tests.reference.colour import srgb_to_linear
 from tests.service.server.pages.conftest import new_context
 from tests.service.server.pages.frames import picture
 
@@ -94,7 +95,7 @@ def test_light_through_aces_is_what_the_service_shows(page, solved):
     assert np.abs(picture(page) - shown).mean() > 0.02
     page.get_by_label("Exposure in stops").fill("-1")  # nothing is clipped: what is shown tells the linear light
     clipped = picture(page)
-    linear = np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)
+    linear = srgb_to_linear(clipped)
     inside = (clipped < 0.95).all(axis=-1) & (clipped > 0.25).all(axis=-1)  # where a step of 1/255 is a small part of the light
     expected = through_view(np.ascontiguousarray(4 * linear[inside][None]).astype(np.float32), "lin_rec709_scene", Review(None, None))[0]
     assert inside.sum() > 500

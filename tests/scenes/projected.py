@@ -1,4 +1,4 @@
-"""Captures under projected patterns, made by a ray caster of its own: spheres and planes, mirrors, fog, textures, blur, gamma and noise.
+"""Captures under projected patterns, made by a ray caster: spheres and planes, mirrors, fog, textures, blur, gamma and noise.
 
 Each camera pixel is sampled at several places, so that pixels at edges mix what they see. A sample is light of one projector place: its
 weight and its (u, v). An image is the sum over these of what the projector shows there, and every pattern costs only that sum.
@@ -6,7 +6,6 @@ weight and its (u, v). An image is the sum over these of what the projector show
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,10 +15,10 @@ import numpy as np
 from scipy.ndimage import convolve1d, shift
 
 from stage.capture.manifest import Frame
-from stage.formats.images import write_png
 from stage.patterns.codes import Pattern, draw
 from stage.patterns.kary import KaryPattern
 from tests.reference.projector import look_at
+from tests.scenes.captures import write_image, write_manifest
 
 FULL_SCALE = 65535
 FINE = 4
@@ -53,6 +52,14 @@ class Wall(NamedTuple):
     """Half of its width and of its height."""
 
 
+Shape = Ball | Wall
+
+
+def rectangle(x_m: tuple[float, float], y_m: tuple[float, float], depth_m: float, albedo: float = 0.6) -> Wall:
+    """Return the rectangle that faces the camera, from and to these places."""
+    return Wall((sum(x_m) / 2, sum(y_m) / 2, -depth_m), (0, 0, 1), albedo, half_m=((x_m[1] - x_m[0]) / 2, (y_m[1] - y_m[0]) / 2))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rig:
     """Pinhole camera and projector; the camera frame has x right, y up, z backward."""
@@ -74,7 +81,7 @@ class Rig:
 class World:
     """What stands before the rig, and how its light is recorded."""
 
-    shapes: Sequence[Ball | Wall]
+    shapes: Sequence[Shape]
     rig: Rig = field(default_factory=Rig)
     fog: float = 0.0
     """Scattering coefficient of a fog without absorption, 1/m: single scattering, evenly in all directions."""
@@ -126,7 +133,7 @@ def trace(world: World) -> Light:
     for down in step:
         for across in step:
             direction = _rays(rig, across, down)
-            distance, normal, albedo, shape = _hit(world.shapes, np.zeros(3), direction)
+            distance, normal, albedo, shape = meet(world.shapes, np.zeros(3), direction)
             point = direction * distance[:, None]
             pixel = np.arange(len(direction))
             seen, weight = point.copy(), np.full(len(direction), share)
@@ -135,7 +142,7 @@ def trace(world: World) -> Light:
                 if not mirror.any():
                     break
                 turned = direction - 2 * (direction * normal).sum(axis=1, keepdims=True) * normal
-                again, other, colour, which = _hit(world.shapes, seen[mirror] + OFFSET_M * normal[mirror], turned[mirror])
+                again, other, colour, which = meet(world.shapes, seen[mirror] + OFFSET_M * normal[mirror], turned[mirror])
                 seen[mirror] = seen[mirror] + turned[mirror] * again[:, None]
                 direction = np.where(mirror[:, None], turned, direction)
                 normal[mirror], albedo[mirror], shape[mirror] = other, colour, which
@@ -146,7 +153,7 @@ def trace(world: World) -> Light:
             if world.fog > 0:
                 _add_fog(world, parts, pixel, _rays(rig, across, down), distance, share)
     middle = _rays(rig, 0.5, 0.5)
-    distance, normal, _, shape = _hit(world.shapes, np.zeros(3), middle)
+    distance, normal, _, shape = meet(world.shapes, np.zeros(3), middle)
     depth = np.where(distance < FAR_M, -middle[:, 2] * distance, np.nan)
     cosine, _, _, _ = _lit(world, middle * distance[:, None], normal)
     return Light(*(np.concatenate(column) for column in zip(*parts, strict=True)), ambient,
@@ -160,35 +167,47 @@ def _rays(rig: Rig, across: float, down: float) -> np.ndarray:
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
-def _hit(shapes: Sequence[Ball | Wall], origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return distance, normal towards the origin, albedo and index of the first shape that rays meet."""
-    best = np.full(len(direction), FAR_M)
-    normal, albedo = np.zeros_like(direction), np.zeros(len(direction))
-    index = np.full(len(direction), len(shapes))
+def meet(shapes: Sequence[Shape], origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return where rays first meet a shape.
+
+    Args:
+        shapes: the shapes.
+        origin: [..., 3] where rays start, metres.
+        direction: [..., 3] unit vectors.
+
+    Returns:
+        [...] distance, FAR_M where nothing is met; [..., 3] normal towards the origin; [...] albedo; [...] index of the shape, their number
+        where nothing is met.
+    """
+    best = np.full(direction.shape[:-1], FAR_M)
+    normal, albedo = np.zeros_like(direction), np.zeros(best.shape)
+    index = np.full(best.shape, len(shapes))
     for number, shape in enumerate(shapes):
         if isinstance(shape, Ball):
             to = origin - np.array(shape.center_m)
-            b = (direction * to).sum(axis=1)
+            b = (direction * to).sum(axis=-1)
             root = b**2 - (to**2).sum(axis=-1) + shape.radius_m**2
             t = -b - np.sqrt(np.maximum(root, 0))
             t = np.where((root > 0) & (t > 0), t, FAR_M)
-            place = origin + direction * t[:, None]
+            place = origin + direction * t[..., None]
             facing = (place - shape.center_m) / shape.radius_m
-            flat = np.stack([np.arctan2(facing[:, 0], facing[:, 2]), np.arcsin(np.clip(facing[:, 1], -1, 1))], axis=1) * shape.radius_m
+            angles = np.arctan2(facing[..., 0], facing[..., 2]), np.arcsin(np.clip(facing[..., 1], -1, 1))
+            flat = np.stack(angles, axis=-1) * shape.radius_m
         else:
             n = np.array(shape.normal) / np.linalg.norm(shape.normal)
             slope = direction @ n
             t = ((np.array(shape.point_m) - origin) @ n) / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
-            place = origin + direction * t[:, None]
+            place = origin + direction * t[..., None]
             right = np.cross([0.0, 1.0, 0.0], n) if abs(n[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
             right = right / np.linalg.norm(right)
-            flat = np.stack([(place - shape.point_m) @ right, (place - shape.point_m) @ np.cross(n, right)], axis=1)
-            t = np.where((t > 0) & (np.abs(flat) <= np.array(shape.half_m)).all(axis=1), t, FAR_M)
-            facing = -n * np.sign(slope)[:, None]
+            flat = np.stack([(place - shape.point_m) @ right, (place - shape.point_m) @ np.cross(n, right)], axis=-1)
+            t = np.where((t > 0) & (np.abs(flat) <= np.array(shape.half_m)).all(axis=-1), t, FAR_M)
+            facing = -n * np.sign(slope)[..., None]
         nearer = t < best
         best = np.where(nearer, t, best)
-        normal = np.where(nearer[:, None], facing, normal)
-        check = np.sign(np.sin(flat[:, 0] * 140) * np.sin(flat[:, 1] * 140)) * 0.6 + 0.4 * np.sin(flat[:, 0] * 900 + flat[:, 1] * 300)
+        normal = np.where(nearer[..., None], facing, normal)
+        x, y = flat[..., 0], flat[..., 1]
+        check = np.sign(np.sin(x * 140) * np.sin(y * 140)) * 0.6 + 0.4 * np.sin(x * 900 + y * 300)
         albedo = np.where(nearer, shape.albedo * (1 - shape.texture * (0.5 + 0.5 * check)), albedo)
         index = np.where(nearer, number, index)
     return best, normal, albedo, index
@@ -201,7 +220,7 @@ def _lit(world: World, point: np.ndarray, normal: np.ndarray) -> tuple[np.ndarra
     far = np.linalg.norm(to, axis=1)
     to = to / far[:, None]
     cosine = np.clip((normal * to).sum(axis=1), 0, None)
-    blocked = _hit(world.shapes, point + OFFSET_M * normal, to)[0] < far - 2 * OFFSET_M
+    blocked = meet(world.shapes, point + OFFSET_M * normal, to)[0] < far - 2 * OFFSET_M
     local = (point - pose[:3, 3]) @ pose[:3, :3]
     ahead = local[:, 2] < -1e-6
     z = np.where(ahead, -local[:, 2], 1.0)
@@ -301,20 +320,19 @@ def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, li
         The light, with the truth.
     """
     light = trace(world) if light is None else light
-    folder.mkdir(parents=True, exist_ok=True)
     rig, entries = world.rig, []
     for number, (frame, pattern) in enumerate(zip(images(world, moments or light, patterns), declared or patterns, strict=True)):
         name = f"{number:03d}.png"
         if aside is not None:
             frame = shift(frame, (*aside[number], *[0] * (frame.ndim - 2)), order=1, mode="nearest")
-        write_png(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16), srgb=False)
+        write_image(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16))
         entries.append(Frame(image=name, pattern=pattern).model_dump(mode="json", exclude_defaults=True))
-    (folder / "capture.json").write_text(json.dumps({
+    write_manifest(folder, {
         "schema": "relit.capture/1", "name": folder.name, "color_space": "lin_rec709_scene",
         "camera": {"projection": "perspective", "resolution": rig.camera, "focal_px": [rig.camera_focal] * 2,
                    "principal_px": [rig.camera[0] / 2, rig.camera[1] / 2]},
         "projector": {"resolution": rig.projector, "focal_px": [rig.projector_focal] * 2,
                       "principal_px": [rig.projector[0] / 2, rig.projector[1] / 2], "camera_from_projector": rig.pose.tolist(),
                       **projector},
-        "frames": entries}))
+        "frames": entries})
     return light
