@@ -172,6 +172,23 @@ def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
     assert solve_sequence(request(tmp_path, max_sigma=5.0)).kept == 0
 
 
+def test_a_step_whose_results_are_not_its_own_is_done_again(tmp_path):
+    """Joined maps stand where a run that joins nothing has its own; others are damaged or deleted."""
+    maps, report = tmp_path / "maps.exr", tmp_path / "report.json"
+
+    def work():
+        maps.write_text("own")
+        report.write_text("{}")
+        return {"found": 1}
+
+    assert steps.do_step(tmp_path, "content", work) == ({"found": 1}, False)
+    assert steps.do_step(tmp_path, "content", work) == ({"found": 1}, True)
+    for damage in (lambda: maps.write_text("joined"), maps.unlink, lambda: report.write_text("joined"), report.unlink):
+        damage()
+        assert steps.do_step(tmp_path, "content", work)[1] is False and maps.read_text() == "own"
+    assert steps.do_step(tmp_path, "other", work)[1] is False
+
+
 def test_what_is_refused(tmp_path, relit):
     write_sequence(tmp_path / "in", [None] * 2, size=16)
     with pytest.raises(RequestError, match=r"--lights refined: each step of a sequence"):
