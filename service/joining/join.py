@@ -20,7 +20,7 @@ from stage.capture.camera import Camera
 from stage.errors import ResultError
 from stage.files import write_text
 from stage.results.depth_maps import CALIBRATION_SIGMA, DEPTH_FILE, DepthMaps
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import JOINED, MAPS_FILE, SurfaceMaps
 from stage.results.result_metadata import result_file
 from stage.stack.fingerprint import digest
 
@@ -114,7 +114,7 @@ def _maps(maps: SurfaceMaps, joined: Joined, contents: dict[str, str]) -> Surfac
     return replace(maps, mask=maps.mask & sure, estimated=maps.mask, normal=np.moveaxis(joined.normal, 0, -1), height=joined.height,
                    height_sigma=joined.sigma, part=numbered(joined.part) if joined.part.max() > 0 else None, status=status,
                    camera=maps.camera.model_copy(update={"surface_z_m": mean_z}),
-                   provenance={**maps.provenance, "relit:joined": json.dumps(contents, sort_keys=True)})
+                   provenance={**maps.provenance, JOINED: json.dumps(contents, sort_keys=True)})
 
 
 def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) -> dict[str, Any]:
