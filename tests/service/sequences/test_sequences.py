@@ -9,7 +9,9 @@ from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.sequences import steps
+from service.sequences.joined_steps import MapsJoiner
 from service.sequences.run import depth_sequence, solve_sequence
+from stage.capture.camera import Camera
 from stage.errors import ManifestError
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
@@ -125,6 +127,25 @@ def test_a_change_of_all_lights_is_taken_out(tmp_path):
     joined, alone = maps_of(tmp_path / "out", 1)
     ratio = [np.median(maps.diffuse_albedo / moment(None).albedo) for maps in (joined, alone)]
     assert ratio[1] - ratio[0] == pytest.approx(0.03, abs=0.005)
+
+
+def test_an_exposure_that_a_step_does_not_declare_is_said_and_another_subject_is_not():
+    """The albedo of a step at half the light, and that of another scene with the same normals."""
+    scene, other = moment(None), moment(None, other=True)
+    random, everywhere = np.random.default_rng(4), np.ones((SIZE, SIZE), bool)
+
+    def step(albedo):
+        normal = scene.normal + np.radians(0.5) * random.normal(size=scene.normal.shape)
+        return SurfaceMaps(camera=Camera(projection="orthographic", resolution=(SIZE, SIZE)), mask=everywhere,
+                           normal=(normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32),
+                           diffuse_albedo=(albedo * (1 + 0.01 * random.normal(size=albedo.shape))).astype(np.float32),
+                           sigma=np.full((SIZE, SIZE), 0.7, np.float32))
+
+    for albedo, factor in ((0.5 * scene.albedo, 0.5), (0.5 * other.albedo, None)):
+        joiner = MapsJoiner(anchored=True)
+        for before in range(2):
+            assert "brightness_apart" not in joiner.join(step(scene.albedo))[1], before
+        assert joiner.join(step(albedo))[1].get("brightness_apart") == (None if factor is None else pytest.approx(factor, rel=0.01))
 
 
 @pytest.mark.long
