@@ -133,7 +133,7 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "parts": int(joined.part.max()) + 1,
         "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
         "contradicted_degrees": round(joined.contradicted_degrees, 2), "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
-        "normals_factor": round(joined.relief.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.relief.shift_px],
+        "normals_factor": round(joined.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
     }
 
@@ -167,7 +167,7 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
     if any(facts["depth_shift_px"]):
         right, down = facts["depth_shift_px"]
         found.append(f"depth: it looks shifted by {right:+.2g} px to the right and {down:+.2g} px down against the normals, as where the "
-                     "camera moved between both: take both from one place; height_sigma holds that")
+                     "camera moved between both: it was moved back, and height_sigma holds that; take both from one place")
     lost = (pixels["mask"] - pixels["placed"]) / pixels["mask"]
     if lost > MANY:
         found.append(f"height: {lost:.0%} of the surface has too few depths to be placed, and is kept as unsure")
