@@ -99,9 +99,6 @@ def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCou
     """Return the number of pulses of these histograms, not below `top`."""
     numbers = [ceil(top / part) for part in PARTS] if declared is None else [declared]
     without = some.likelihood(None, pulse)[0]
-    refitted = some.likelihood(None, shape_of(without_pileup(some.placed), some.counts))[0]
-    if refitted.sum() > without.sum():  # the pulse is that of these histograms in both cases
-        without = refitted
     if abs(pulse.mean) > SKEWED * pulse.width:  # what leans may be pile-up itself
         pulse = shape_of(correct_pileup(some.placed, pulses=ceil(top / FULL)), some.counts)
 
@@ -120,6 +117,10 @@ def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCou
     if declared is None:
         best, gain = _refined(gain_of, best, gain, top)
     value, found = some.likelihood(best, pulse)
+    refitted = some.likelihood(None, shape_of(without_pileup(some.placed), some.counts))[0]
+    if refitted.sum() > without.sum():  # the pulse is that of these histograms in both cases
+        without = refitted
+        gain = float((value - without).sum())
     dispersion, unexplained = _misfit(some.counts, found, pulse, best)
     chance = SURE * float(np.sqrt(len(value)) * (value - without).std())
     if gain / dispersion - some.spent(best) < max(LEAST_GAIN, chance) or gain < unexplained:
