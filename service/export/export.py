@@ -119,7 +119,7 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
         warnings += multiplied_sentences({around.environment.name: read_header(around.environment).multiplied})
     if (plain := _plain(maps)) is not None:
         warnings.append(plain)
-    if around.rig is not None and (doubt := other_manifest(maps, around.rig, path)) is not None:
+    if around.rig is not None and (doubt := other_manifest(maps.camera, maps.provenance, around.rig, path)) is not None:
         warnings.append(doubt)
     if maps.status is not None and (doubtful := doubtful_normals(maps.status)) is not None:
         warnings.append(doubtful)

@@ -57,32 +57,37 @@ def correct(
     """
     rejected = _outliers(difference, sigma, known)
     weight = np.where(known & ~rejected, 1 / sigma**2, 0)
-    value = np.full(difference.shape, (weight * np.where(known, difference, 0)).sum() / weight.sum())
-    variance = np.full(difference.shape, 1 / weight.sum())
-    cover, shared = inside.astype(np.float64), 0.0
+    cover = inside.astype(np.float64)
     levels = max(1, int(np.ceil(np.log2(max(difference.shape)))))
     sides = 2.0 ** np.arange(levels)
     drift = (np.hypot(slope_error, DRIFT * np.minimum(2 * sides / max(difference.shape), 1) ** 2) * sides) ** 2
-    for level in range(levels - 1, -1, -1):
-        for again in range(PASSES):
-            weights = sum_cells(weight, level)
-            left = sum_cells(weight * np.where(known, difference - value, 0), level) / np.where(weights > 0, weights, 1)
-            whole = weights.sum()
-            cells = (weights > 0).sum()
-            noise = cells / whole  # mean of 1 / weights, weighted like the differences
-            found = max((weights * left**2).sum() / whole - noise, 0.0)
-            error = min(found, drift[level])
-            told = weights / (1 + (found - error) * weights)
-            if again == 0:  # as much error as the noise may hide
-                hidden = error + noise * np.sqrt(2 / cells)
-                variance += _spread(hidden / (1 + hidden * told), cover, level)
-                shared = max(shared, found - error)
-            if error == 0:
-                break
-            value += _spread(error * told / (error * told + 1) * left, cover, level)
+    shared, finer = np.zeros(levels), np.zeros(levels)
+    for _ in range(PASSES):
+        value = np.full(difference.shape, (weight * np.where(known, difference, 0)).sum() / weight.sum())
+        variance = np.full(difference.shape, 1 / weight.sum())
+        for level in range(levels - 1, -1, -1):
+            for again in range(PASSES):
+                weights = sum_cells(weight, level)
+                left = sum_cells(weight * np.where(known, difference - value, 0), level) / np.where(weights > 0, weights, 1)
+                weights = weights / (1 + finer[level] * weights)
+                whole = weights.sum()
+                cells = (weights > 0).sum()
+                noise = cells / whole  # mean of 1 / weights, weighted like the differences
+                found = max((weights * left**2).sum() / whole - noise, 0.0)
+                error = min(found, drift[level])
+                told = weights / (1 + (found - error) * weights)
+                if again == 0:  # as much error as the noise may hide
+                    hidden = error + noise * np.sqrt(2 / cells)
+                    variance += _spread(hidden / (1 + hidden * told), cover, level)
+                    shared[level] = found - error
+                if error == 0:
+                    break
+                value += _spread(error * told / (error * told + 1) * left, cover, level)
+        for level in range(1, levels):  # what neighbours share over cells of one scale is left in the mean of the four of the next
+            finer[level] = max(shared[level - 1], finer[level - 1]) / 4
     used = known & ~rejected
     one_sided = _one_sided(((difference - value) / sigma)[used]) * float(np.median(sigma[used]))
-    return Correction(value, variance + one_sided**2, rejected, float(np.sqrt(shared)), one_sided)
+    return Correction(value, variance + one_sided**2, rejected, float(np.sqrt(shared.max())), one_sided)
 
 
 def _one_sided(left: np.ndarray) -> float:

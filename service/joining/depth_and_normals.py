@@ -6,10 +6,12 @@ normals and not noise of the depth.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from kernels.device import to_numpy
 from kernels.errors import ArrayError
@@ -17,12 +19,14 @@ from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from kernels.surface.slopes import STEEPEST
 from service.joining.correction import correct
 from service.joining.depth_steps import SLOPE_ERROR, Edges, find_steps
-from service.joining.relief import Relief, compare_relief
+from service.joining.relief import relief_factor, relief_shift_px
 from service.light_estimation.lambertian import degrees_between
 from stage.spread import MAD_TO_SIGMA
 
 LEAST_DEPTHS = 12
 """Number of depths by which a part is placed; one with fewer has no place of its own."""
+TURN = 0.05
+"""Angle, radians, by which normals are turned about the image's axes to tell what turned lights make of their heights."""
 MOST_NOISE, MOST_EDGES = 1000.0, 300_000
 """The largest factor of the noise that is looked for, and the edges that tell it."""
 
@@ -41,7 +45,10 @@ class Joined(NamedTuple):
     """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
     noise_factor: float
     """By which the noise of the depths exceeds their standard deviations."""
-    relief: Relief
+    factor: float
+    """By which the relief of the depth exceeds that of the normals; 1 where it is not sure to."""
+    shift_px: tuple[float, float]
+    """By how much the depth lies to the right and down against the normals, which it was moved back by; 0 where it is not sure."""
     shared_m: float
     """Standard deviation of errors that neighbouring depths share."""
     one_sided_m: float
@@ -78,9 +85,10 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     u_sigma = u_sigma * noise_factor
     cuts = find_steps(u, u_sigma, both, right, down)
     mean_z = -float(np.median(depth[measured]))
-    found = integrate_normals(normal.astype(np.float32), solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective,
-                              mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
-                              options=IntegrationOptions(discontinuities=True), device=device, progress=progress)
+    integrated = partial(integrate_normals, mask=solved, x=x.astype(np.float32), y=y.astype(np.float32), perspective=perspective,
+                         mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
+                         options=IntegrationOptions(discontinuities=True), device=device)
+    found = integrated(normal.astype(np.float32), progress=progress)
     part = found.part
     assert part is not None
     base = plane.to_heights(to_numpy(found.height).astype(np.float64), solved)
@@ -90,8 +98,16 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~known
     unlike, left, shared, one_sided = 0.0, 0.0, 0.0, 0.0
     largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
-    relief = compare_relief(u, u_sigma, base, known & (part == largest), part)
-    base = base * relief.factor
+    factor = relief_factor(u, u_sigma, base, known & (part == largest), part)
+    base = base * factor
+    shift_px = relief_shift_px(u, u_sigma, base, known & (part == largest), part)
+    if any(shift_px):  # lights that are turned look alike where surfaces are round
+        turned = (np.einsum("ij,jrc->irc", Rotation.from_rotvec(axis).as_matrix(), normal) for axis in TURN * np.eye(3)[:2])
+        drifts = [plane.to_heights(to_numpy(integrated(other.astype(np.float32)).height).astype(np.float64), solved) - base
+                  for other in turned]
+        shift_px = relief_shift_px(u, u_sigma, base, known & (part == largest), part, drifts)
+    shifted = _shifted(base, shift_px)
+    u = u + shifted
     for box, here in _parts(part):
         seen = here & known[box]
         if seen.sum() < LEAST_DEPTHS:
@@ -105,17 +121,15 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         used = seen & ~fixed.rejected
         unlike += _variation(u[box][used], u_sigma[box][used])
         left += _variation((u - base)[box][used], u_sigma[box][used])
-    # turned lights look like a shift where surfaces are round, but the correction takes them up, and not a shift
-    shift_px = compare_relief(u - correction, u_sigma, base, known & (part == largest) & ~rejected, part).shift_px
-    variance += _shifted(base, shift_px)
+    variance += shifted**2
     turn = degrees_between(normal, plane.turned(normal.astype(np.float64), slopes, correction, part, solved))[placed]
     contradicted = float(np.median(turn)) if turn.size else 0.0
     if contradicted <= np.degrees(max(SLOPE_ERROR, float(np.median(normal_sigma[solved])))):
         contradicted = 0.0
-    disputed = (1 - 1 / relief.factor) * base + (correction if contradicted else 0)
+    disputed = (1 - 1 / factor) * base + (correction if contradicted else 0)
     if placed.any():  # which of the two is right, and where their surfaces meet, is unknown
         variance += (apart := (disputed - disputed[placed].mean()) ** 2) + apart[placed].mean()
-    corrected = plane.turned(normal.astype(np.float64), slopes, correction + (1 - 1 / relief.factor) * base, part, solved)
+    corrected = plane.turned(normal.astype(np.float64), slopes, correction + (1 - 1 / factor) * base, part, solved)
     z = np.where(placed, plane.to_z(base + correction), 0)
     sigma = np.where(placed, plane.to_depth_sigmas(z, np.sqrt(variance)), 0)
     unplaced = solved & ~placed
@@ -124,15 +138,15 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
     shared_m, one_sided_m = (float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided))
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
-                  None if unlike == 0 else left / unlike, noise_factor, Relief(relief.factor, shift_px),
+                  None if unlike == 0 else left / unlike, noise_factor, factor, shift_px,
                   shared_m, one_sided_m, contradicted)
 
 
 def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
-    """Return the squares of by how much heights differ from those that are shifted."""
+    """Return by how much heights differ from those that are shifted."""
     if not any(shift_px):
         return np.zeros(base.shape)
-    return np.asarray(sum(np.gradient(base, axis=axis) * part for axis, part in zip((1, 0), shift_px, strict=True)) ** 2)
+    return np.asarray(sum(np.gradient(base, axis=axis) * part for axis, part in zip((1, 0), shift_px, strict=True)))
 
 
 def _variation(values: np.ndarray, sigma: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from stage.capture.camera import Camera
 from stage.errors import ResultError
 from stage.files import write_text
 from stage.results.depth_maps import CALIBRATION_SIGMA, DEPTH_FILE, DepthMaps
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import JOINED, MAPS_FILE, SurfaceMaps
 from stage.results.result_metadata import result_file
 from stage.stack.fingerprint import digest
 
@@ -114,7 +114,7 @@ def _maps(maps: SurfaceMaps, joined: Joined, contents: dict[str, str]) -> Surfac
     return replace(maps, mask=maps.mask & sure, estimated=maps.mask, normal=np.moveaxis(joined.normal, 0, -1), height=joined.height,
                    height_sigma=joined.sigma, part=numbered(joined.part) if joined.part.max() > 0 else None, status=status,
                    camera=maps.camera.model_copy(update={"surface_z_m": mean_z}),
-                   provenance={**maps.provenance, "relit:joined": json.dumps(contents, sort_keys=True)})
+                   provenance={**maps.provenance, JOINED: json.dumps(contents, sort_keys=True)})
 
 
 def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "parts": int(joined.part.max()) + 1,
         "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
         "contradicted_degrees": round(joined.contradicted_degrees, 2), "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
-        "normals_factor": round(joined.relief.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.relief.shift_px],
+        "normals_factor": round(joined.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
     }
 
@@ -167,7 +167,7 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
     if any(facts["depth_shift_px"]):
         right, down = facts["depth_shift_px"]
         found.append(f"depth: it looks shifted by {right:+.2g} px to the right and {down:+.2g} px down against the normals, as where the "
-                     "camera moved between both: take both from one place; height_sigma holds that")
+                     "camera moved between both: it was moved back, and height_sigma holds that; take both from one place")
     lost = (pixels["mask"] - pixels["placed"]) / pixels["mask"]
     if lost > MANY:
         found.append(f"height: {lost:.0%} of the surface has too few depths to be placed, and is kept as unsure")

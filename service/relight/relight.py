@@ -160,7 +160,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             images = guide.images
             stack = images.stack
         findings.add_doubt(guide.doubt)
-        findings.add_doubt(other_manifest(maps, opened.capture, opened.maps))
+        findings.add_doubt(other_manifest(maps.camera, maps.provenance, opened.capture, opened.maps))
     images = images or ImagesOnDevice(stack, device)
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))

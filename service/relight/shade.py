@@ -166,7 +166,7 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     findings = FrameFindings(guided=True)
     findings.add_beyond([None], [light.share_beyond], captured.beyond_degrees)
     findings.add_doubt(guide.doubt)
-    findings.add_doubt(other_manifest(maps, capture, path))
+    findings.add_doubt(other_manifest(maps.camera, maps.provenance, capture, path))
     findings.add_clipped([None], light.weights[None], clipping)
     assert light.model is not None
     specular = guide.correct(frames, [light.model], specular=True)

@@ -13,11 +13,11 @@ from typing import Any
 from service import __version__
 from service.requests.base.base import Options, Role
 from service.requests.base.options import role_of
+from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest, read_manifest
 from stage.colour.configuration import current
 from stage.errors import ResultError
-from stage.results.maps import SurfaceMaps
 from stage.stack.ingest import LAYOUT
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencolorio", "opencv-python-headless", "usd-core")
@@ -99,11 +99,12 @@ def hash_of_lights(manifest: Manifest) -> str:
     return hashlib.sha256(json.dumps(declared).encode()).hexdigest()
 
 
-def other_manifest(maps: SurfaceMaps, capture: Capture, path: Path) -> str | None:
-    """Return the sentence for maps, read from a path, of a capture whose manifest had another camera or other lights; None: the same."""
-    differs = [f"another camera.{name}" for name, value in maps.camera if value != getattr(capture.camera, name)]
+def other_manifest(camera: Camera, provenance: Mapping[str, str], capture: Capture, path: Path) -> str | None:
+    """Return the sentence for maps with this camera and provenance, read from a path, of a capture whose manifest had another camera or
+    other lights; None: the same."""
+    differs = [f"another camera.{name}" for name, value in camera if value != getattr(capture.camera, name)]
     lights = hash_of_lights(read_manifest(capture.folder / FILE_NAME))  # as declared: a capture as solved has brighter lights
-    differs += ["other lights"] if maps.provenance.get(LIGHTS, lights) != lights else []
+    differs += ["other lights"] if provenance.get(LIGHTS, lights) != lights else []
     return None if not differs else (f"{path}: was solved with {', '.join(differs)} than the manifest of the capture has now: solve it "
                                      "again, or what the maps say does not fit the images")
 

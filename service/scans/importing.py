@@ -13,10 +13,11 @@ from service.scans.file_scans import FileScan, read_file_scans
 from service.scans.points.rigid import nearest_rigid
 from service.scans.viewpoints import find_viewpoints
 from stage.errors import ManifestError, storage
+from stage.folders import natural_order
 from stage.formats.ply import write_ply
 from stage.importers.depth_frames import DEPTH, frame_layout, pose_of
 from stage.importers.guess import POINT_FILES, depth_results
-from stage.importers.layout import Imported, natural_order, place_images, read_lines
+from stage.importers.layout import Imported, place_images, read_lines
 from stage.results.depth_maps import DEPTH_FILE
 from stage.results.maps import MAPS_FILE
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, Turntable, write_scan_set

@@ -25,6 +25,9 @@ FIGURES = re.compile(r"\d[\d.]*")
 """The numbers in a sentence, which may differ between steps whose sentences say the same."""
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
 """The warning in the report about a sequence without a file."""
+BRIGHTER = ("albedo: is {:.3g} times that of the steps before, by one factor where the normals agree, and is not joined with it: check "
+            "exposure_s and the lights of the steps")
+"""The warning about a step whose albedo is another one by a factor."""
 OF_LIGHTS = ("found", "suspect_lights")
 """Entries that the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
 
@@ -106,6 +109,7 @@ def _finish(request: Any, step: TimeStep, folder: Path, alone: Path, mask: np.nd
     """Write the report of a joined step, and return what the report of the sequence says of it."""
     found = step_report(alone)
     pixels, warnings = found.get("pixels", {}), [str(sentence) for sentence in found.get("warnings", [])]
+    warnings += [BRIGHTER.format(facts["brightness_apart"])] if "brightness_apart" in facts else []
     if request.temporal:
         write_text(folder / REPORT_FILE, report(
             request.model_copy(update={"capture": step.folder}),

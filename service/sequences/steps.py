@@ -21,6 +21,9 @@ from stage.capture.manifest import FILE_NAME
 from stage.capture.sequence import Sequence, TimeStep, check_alike, read_sequence
 from stage.errors import ResultError
 from stage.files import write_text
+from stage.formats.ply import POINTS_FILE
+from stage.results.depth_maps import DEPTH_FILE
+from stage.results.maps import MAPS_FILE
 from stage.stack.fingerprint import Fingerprints, digest
 from stage.stack.ingest import CACHE_FOLDER
 
@@ -29,6 +32,8 @@ ALONE = "alone"
 DONE_FILE = "step.json"
 """The file that marks a step as done, and names its inputs; written last."""
 DONE_SCHEMA = "relit.step/1"
+RESULTS = (MAPS_FILE, DEPTH_FILE, POINTS_FILE, REPORT_FILE)
+"""The files that a solve or a depth leaves."""
 AnyRequest = TypeVar("AnyRequest", SolveRequest, DepthRequest)
 
 
@@ -75,7 +80,12 @@ def done(folder: Path, content: str) -> dict[str, Any] | None:
     """Return what a step that is done has left for others, or None where it is not done, or not from this content of capture_digest."""
     found = _done_file(folder)
     left = found.get("left")
-    return left if isinstance(left, dict) and found.get("content") == content and (folder / REPORT_FILE).is_file() else None
+    return left if isinstance(left, dict) and found.get("content") == content and found.get("results") == _results(folder) else None
+
+
+def _results(folder: Path) -> dict[str, str]:
+    """Return the content hash of each result of a step that its folder holds: what was damaged or written by another run is told."""
+    return {name: digest(folder / name) for name in RESULTS if (folder / name).is_file()}
 
 
 def _done_file(folder: Path) -> dict[str, Any]:
@@ -94,7 +104,8 @@ def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> t
         return left, True
     (folder / DONE_FILE).unlink(missing_ok=True)
     left = work()
-    write_text(folder / DONE_FILE, json.dumps({"schema": DONE_SCHEMA, "content": content, "left": left}) + "\n")
+    said = {"schema": DONE_SCHEMA, "content": content, "results": _results(folder), "left": left}
+    write_text(folder / DONE_FILE, json.dumps(said) + "\n")
     return left, False
 
 

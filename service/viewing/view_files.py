@@ -15,7 +15,7 @@ from kernels.errors import DeviceError, KernelError
 from service.captures.info import standing_faults
 from service.relight.outputs import check_outputs
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import REPORT_FILE, metadata
+from service.reporting.provenance import REPORT_FILE, metadata, other_manifest
 from service.requests.captures import ViewRequest
 from service.viewing.block_file import BlockFile
 from service.viewing.capture_frames import describe_frames, read_images, write_thumbnails
@@ -125,6 +125,8 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     mask = _mask(capture)
     images = read_images(capture, mask, timings)
     findings = list(dict.fromkeys([*images.faults, *standing_faults(capture)]))
+    if result is not None and (doubt := other_manifest(result.camera, result.provenance, capture, result.path)) is not None:
+        findings.append(doubt)
     space = linear_space(capture.manifest.color_space)
     target = request.out / VIEW_FILE
     sections: dict[str, Any] = {"layers": [], "relight": None, "samples": None, "points": None}

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from stage.capture.manifest import FILE_NAME, Manifest, read_manifest
 from stage.errors import ManifestError, storage
 from stage.files import write_text
+from stage.folders import natural_order
 from stage.model import FirstFault, NotNegative, Positive, Strict, Text
 from stage.records import read_record
 
@@ -101,9 +102,9 @@ def is_sequence(path: Path) -> bool:
 
 
 def capture_folders(folder: Path) -> list[Path]:
-    """Return the folders in a folder that hold a capture, in order of name."""
+    """Return the folders in a folder that hold a capture, in order of name: 2 before 10."""
     with storage("read", folder):
-        return sorted(inside for inside in folder.iterdir() if (inside / FILE_NAME).is_file())
+        return [folder / name for name in natural_order(inside.name for inside in folder.iterdir() if (inside / FILE_NAME).is_file())]
 
 
 def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequence:

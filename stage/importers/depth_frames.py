@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.errors import ManifestError, storage
-from stage.importers.layout import image_names, natural_order, read_json, read_lines
+from stage.folders import natural_order
+from stage.importers.layout import image_names, read_json, read_lines
 from stage.sets.scan_set import MOST_OFF_ROTATION
 from stage.transforms import rigid_fault, scaled_rotation
 

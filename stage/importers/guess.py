@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
-from stage.folders import advice
+from stage.folders import advice, natural_order
 from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.content import Pictures
@@ -20,7 +20,7 @@ from stage.importers.depth_frames import frame_layout, read_intrinsics
 from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, lit, made, tried
 from stage.importers.laser import NAMES as PLANES
 from stage.importers.laser import OFF_WORDS, read_planes
-from stage.importers.layout import image_names, natural_order, read_lines
+from stage.importers.layout import image_names, read_lines
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table

@@ -17,8 +17,9 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError, storage
+from stage.folders import natural_order
 from stage.importers.camera_options import View
-from stage.importers.layout import Imported, natural_order, write_capture
+from stage.importers.layout import Imported, write_capture
 
 WIDTH, HEIGHT = 512, 424
 BITS, IMAGES, USED = 11, 10, 9

@@ -5,7 +5,6 @@ import io
 import json
 import math
 import os
-import re
 import shutil
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,6 +20,7 @@ from stage.capture.manifest import FILE_NAME, SCHEMA, Manifest, manifest_text, w
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
+from stage.folders import natural_order
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.records import describe
@@ -48,12 +48,6 @@ class Imported(NamedTuple):
     """The manifest."""
     facts: tuple[tuple[str, str], ...]
     """Names and sentences of what was understood, for the person who asked: nothing is guessed without being shown."""
-
-
-def natural_order(names: Iterable[str]) -> list[str]:
-    """Return names in the order in which people count: 2 before 10."""
-    return sorted(names, key=lambda name: [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower())
-                                           for part in re.split(r"(\d+)", name)])
 
 
 def image_names(folder: Path) -> list[str]:

@@ -15,6 +15,7 @@ from stage.capture.lighting import MEASURED_BY
 from stage.capture.manifest import FILE_NAME
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
+from stage.folders import natural_order
 from stage.importers.camera_options import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
 from stage.importers.layout import (
     Imported,
@@ -24,7 +25,6 @@ from stage.importers.layout import (
     image_named,
     image_resolution,
     light_scale,
-    natural_order,
     write_capture,
 )
 from stage.importers.light_rig import LightRig, read_rig

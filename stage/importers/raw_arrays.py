@@ -12,8 +12,9 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError, StorageError, storage
+from stage.folders import natural_order
 from stage.formats.mat_file import read_mat_arrays
-from stage.importers.layout import natural_order, read_json
+from stage.importers.layout import read_json
 from stage.tof.raw_frames import read_array
 
 SUFFIXES = (".npy", ".npz", ".mat", ".json", ".bin", ".raw", ".dat")

@@ -49,6 +49,8 @@ def import_folder(source: Path, destination: Path | None, *, color_space: ColorS
     near = near if near and width_mm > 0 else None
     vectors = _of_images(path, dome, near or "directions", "xyz", entries)
     if vectors is None and near is None:
+        if str(dome.get("lightConfiguration", "")) in POSITIONS and not all(entry.get("direction") for entry in used):
+            raise ManifestError(f"{path}: dome.imageWidth: is not set, which positions of near lights need: set it in RelightLab")
         vectors = _vectors(path, "images[].direction", [entry.get("direction") for entry in used], "xyz")
     if vectors is None:
         raise ManifestError(f"{path}: dome.{near}: is missing or does not have one light for each image")

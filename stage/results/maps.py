@@ -18,6 +18,8 @@ from stage.results.result_metadata import camera_and_provenance, result_metadata
 MAPS_FILE = "maps.exr"
 ALBEDO_SCALE = "relit:albedo_scale"
 """The attribute with the factor between the albedo of the maps and that under the lights of the capture, where it is not 1."""
+JOINED = "relit:joined"
+"""The attribute of maps whose height a depth has placed, with the content hashes of both: surface_z_m of their camera is its mean."""
 _RGB, _XYZ = ("R", "G", "B"), ("X", "Y", "Z")
 LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "normal": (_XYZ, np.float32),
@@ -142,9 +144,16 @@ class SurfaceMaps:
 
 def capture_as_solved(capture: Capture, path: Path) -> Capture:
     """Return a capture with what its solve has added: the distance of the surface, where the manifest lacks it and its near lights need it,
-    and lights under which the albedo of the maps in this file looks as the images do."""
+    or where a depth was joined with the maps, and lights under which the albedo of the maps in this file looks as the images do."""
     metadata = exr.read_header(path).metadata
     found = camera_and_provenance(metadata, path, file_name=MAPS_FILE)[0].surface_z_m
-    if found is not None and distance_is_missing(capture):
+    if found is not None and (JOINED in metadata or distance_is_missing(capture)):
         capture = capture.at_distance(found)
-    return capture.with_brighter_lights(1 / float(str(metadata.get(ALBEDO_SCALE, 1))))
+    told = str(metadata.get(ALBEDO_SCALE, 1))
+    try:
+        scale = float(told)
+    except ValueError:
+        scale = 0.0
+    if not 0 < scale < np.inf:
+        raise ResultError(f"{path}: its attribute {ALBEDO_SCALE} is {told}: it must be a number above 0")
+    return capture.with_brighter_lights(1 / scale)

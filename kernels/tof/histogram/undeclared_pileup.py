@@ -27,6 +27,8 @@ RETURNS = 3
 """Most returns fitted in a pixel."""
 LEAST_GAIN = 8.0
 """Log likelihood by which pile-up must explain the histograms better, beyond what it gains without any: four standard deviations."""
+SURE = 4.0
+"""Standard deviations, by how much histograms differ in it, by which the gain must be above nothing."""
 DIMMER = 0.7
 """Largest ratio of the fullest histogram of the dimmer half to the fullest of all at which the two halves are compared."""
 SKEWED, FULL = 0.05, 0.9
@@ -99,9 +101,13 @@ def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCou
     without = some.likelihood(None, pulse)[0]
     if abs(pulse.mean) > SKEWED * pulse.width:  # what leans may be pile-up itself
         pulse = shape_of(correct_pileup(some.placed, pulses=ceil(top / FULL)), some.counts)
+
+    def gain_of(pulses: int) -> float:
+        return float((some.likelihood(pulses, pulse)[0] - without).sum())
+
     best, gain = 0, 0.0
     for _ in range(ROUNDS):
-        gains = [some.likelihood(pulses, pulse)[0] - without for pulses in numbers]
+        gains = [gain_of(pulses) for pulses in numbers]
         last, best, gain = best, numbers[int(np.argmax(gains))], max(gains)
         if gain - some.spent(best) < LEAST_GAIN or top / best < LEAST_PART:
             return None
@@ -109,18 +115,23 @@ def _among(some: "_Counted", top: int, pulse: Pulse, shape_of: Callable[[LiveCou
             break
         pulse = shape_of(correct_pileup(some.placed, pulses=best), some.counts)
     if declared is None:
-        best, gain = _refined(lambda pulses: some.likelihood(pulses, pulse)[0] - without, best, gain, top)
+        best, gain = _refined(gain_of, best, gain, top)
     value, found = some.likelihood(best, pulse)
+    refitted = some.likelihood(None, shape_of(without_pileup(some.placed), some.counts))[0]
+    if refitted.sum() > without.sum():  # the pulse is that of these histograms in both cases
+        without = refitted
+        gain = float((value - without).sum())
     dispersion, unexplained = _misfit(some.counts, found, pulse, best)
-    if gain / dispersion - some.spent(best) < LEAST_GAIN or gain < unexplained:
+    chance = SURE * float(np.sqrt(len(value)) * (value - without).std())
+    if gain / dispersion - some.spent(best) < max(LEAST_GAIN, chance) or gain < unexplained:
         return None
     dim = some.dimmer_half()
     as_bent = ceil(max(best * dim.top / some.top, dim.top + 1))
-    if dim.top < DIMMER * some.top and dim.likelihood(as_bent, pulse)[0] > dim.likelihood(best, pulse)[0] + dim.spent(as_bent):
+    if dim.top < DIMMER * some.top and dim.likelihood(as_bent, pulse)[0].sum() > dim.likelihood(best, pulse)[0].sum() + dim.spent(as_bent):
         return None
     if declared is not None:
         return PulseCount(best, 0.0, top / best)
-    lost = max(value - some.likelihood(max(int(best * NEARBY), best + 1), pulse)[0], 0.5) / dispersion
+    lost = max((value - some.likelihood(max(int(best * NEARBY), best + 1), pulse)[0]).sum(), 0.5) / dispersion
     relative = np.log(NEARBY) / np.sqrt(2 * lost)
     if top < PINNED * best:
         relative = np.hypot(relative, 0.5 * some.spent(best) / gain)
@@ -150,17 +161,17 @@ class _Counted:
     def dimmer_half(self) -> "_Counted":
         return _Counted(self.counts[self.total <= np.median(self.total)], self.device)
 
-    def likelihood(self, pulses: int | None, pulse: Pulse) -> tuple[float, Returns]:
-        """Return the log probability of all histograms at their best returns, less a part that does not depend on the pulses."""
+    def likelihood(self, pulses: int | None, pulse: Pulse) -> tuple[np.ndarray, Returns]:
+        """Return the log probability of each histogram at its best returns, [pixel], less a part that does not depend on the pulses."""
         histograms = without_pileup(self.placed) if pulses is None else correct_pileup(self.placed, pulses=pulses)
         found = find_returns(histograms, pulse, most=RETURNS)
-        value = float(to_numpy(found.likelihood).sum(dtype=np.float64))  # above that of one photon a bin
+        value = to_numpy(found.likelihood)[: len(self.counts)].astype(np.float64)  # above that of one photon a bin
         if pulses is None:
-            return value - self.counts.size, found
+            return value - self.counts.shape[1], found
         left = pulses - (np.cumsum(self.counts, axis=1) - self.counts)
         of_one = -np.expm1(-1 / pulses) * pulses
-        value += float(self.total.sum() * np.log(of_one) - (left - self.counts).sum() / pulses)
-        value += sum(lgamma(pulses + 1) - lgamma(pulses - t + 1) - t * np.log(pulses) for t in self.total)
+        value += self.total * np.log(of_one) - (left - self.counts).sum(axis=1) / pulses
+        value += [lgamma(pulses + 1) - lgamma(pulses - t + 1) - t * np.log(pulses) for t in self.total]
         return value, found
 
     def spent(self, pulses: int) -> float:

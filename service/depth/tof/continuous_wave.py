@@ -21,7 +21,17 @@ from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
 from service.depth.tof.inside_out import misread_shape
-from service.depth.tof.phase_checks import DOUBTED, Phases, beyond_span, full_at, misread_direction, misread_frequencies, unfitting_images
+from service.depth.tof.phase_checks import (
+    DOUBTED,
+    Phases,
+    beyond_span,
+    full_at,
+    misread_direction,
+    misread_frequencies,
+    unfitting_images,
+    unfitting_pixels,
+    unfitting_share,
+)
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -34,6 +44,9 @@ LEAST_IN_BIN = 32
 LEAST_READ_ELECTRONS = 5.0
 """Read noise in electrons that is assumed where every part of the image is too bright to show it: black pixels must not pass for noise-free
 ones."""
+OFF_LINE, FEW_OFF = 4.0, 0.25
+"""How many times the noise of the line a bin must have to count as little as at first, and the part of the bins below which they must be:
+such bins hold pixels of which an image is lost."""
 HIDDEN = 4.0
 """The read noise cannot be measured when the variance of shot noise in the darkest bin is more than this many times that of
 LEAST_READ_ELECTRONS."""
@@ -132,7 +145,8 @@ def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
         elif base < 0:
             shot, base = (sxy / sxx if sxx > 0 else 0.0), 0.0
         model = base + shot * np.maximum(x, 0)
-        weight = 1 / np.maximum(model, model.max() * 1e-6 + 1e-30)
+        off = y > OFF_LINE * model
+        weight = 1 / np.where(off & (off.mean() < FEW_OFF), y, np.maximum(model, model.max() * 1e-6 + 1e-30))
     shot, base = max(float(shot), 0.0), max(float(base), 0.0)
     unseen = (LEAST_READ_ELECTRONS * shot) ** 2
     if shot * float(x.min()) > HIDDEN * unseen:
@@ -171,6 +185,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     noise, source = _noise(frames, calibration, whole)
     found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
                    device=device)
+    unfit = unfitting_pixels(found, noise, rows * cols)
     found = _straighten(found, calibration)
     reach = np.zeros(rows * cols, dtype=np.int32)
     if options.vote:
@@ -226,6 +241,10 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
     if wrong is not None and size_rad > SCATTERED_RAD:
         confidence = confidence * DOUBTED
+    else:
+        confidence = np.where(unfit, confidence * DOUBTED, confidence)
+        partly = unfitting_share(float((unfit & lit).sum() / max(lit.sum(), 1)))
+        warnings += [] if partly is None else [partly]
     facts = {
         "modulation_hz": found.modulation_hz.tolist(),
         "images": len(frames.images),

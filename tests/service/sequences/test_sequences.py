@@ -9,7 +9,9 @@ from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.sequences import steps
+from service.sequences.joined_steps import MapsJoiner
 from service.sequences.run import depth_sequence, solve_sequence
+from stage.capture.camera import Camera
 from stage.errors import ManifestError
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
@@ -127,6 +129,25 @@ def test_a_change_of_all_lights_is_taken_out(tmp_path):
     assert ratio[1] - ratio[0] == pytest.approx(0.03, abs=0.005)
 
 
+def test_an_exposure_that_a_step_does_not_declare_is_said_and_another_subject_is_not():
+    """The albedo of a step at half the light, and that of another scene with the same normals."""
+    scene, other = moment(None), moment(None, other=True)
+    random, everywhere = np.random.default_rng(4), np.ones((SIZE, SIZE), bool)
+
+    def step(albedo):
+        normal = scene.normal + np.radians(0.5) * random.normal(size=scene.normal.shape)
+        return SurfaceMaps(camera=Camera(projection="orthographic", resolution=(SIZE, SIZE)), mask=everywhere,
+                           normal=(normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32),
+                           diffuse_albedo=(albedo * (1 + 0.01 * random.normal(size=albedo.shape))).astype(np.float32),
+                           sigma=np.full((SIZE, SIZE), 0.7, np.float32))
+
+    for albedo, factor in ((0.5 * scene.albedo, 0.5), (0.5 * other.albedo, None)):
+        joiner = MapsJoiner(anchored=True)
+        for before in range(2):
+            assert "brightness_apart" not in joiner.join(step(scene.albedo))[1], before
+        assert joiner.join(step(albedo))[1].get("brightness_apart") == (None if factor is None else pytest.approx(factor, rel=0.01))
+
+
 @pytest.mark.long
 def test_intensities_of_the_first_step_are_those_of_all(tmp_path):
     """Lights that are 10 % off in every step; in the last other lights are, which the images contradict."""
@@ -170,6 +191,23 @@ def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
     write_step(tmp_path / "in" / "step01", moment(None, size=24), seed=77, noise=NOISE)
     assert solve_sequence(request(tmp_path)).kept == 2 and solved[4:] == ["step01"]
     assert solve_sequence(request(tmp_path, max_sigma=5.0)).kept == 0
+
+
+def test_a_step_whose_results_are_not_its_own_is_done_again(tmp_path):
+    """Joined maps stand where a run that joins nothing has its own; others are damaged or deleted."""
+    maps, report = tmp_path / "maps.exr", tmp_path / "report.json"
+
+    def work():
+        maps.write_text("own")
+        report.write_text("{}")
+        return {"found": 1}
+
+    assert steps.do_step(tmp_path, "content", work) == ({"found": 1}, False)
+    assert steps.do_step(tmp_path, "content", work) == ({"found": 1}, True)
+    for damage in (lambda: maps.write_text("joined"), maps.unlink, lambda: report.write_text("joined"), report.unlink):
+        damage()
+        assert steps.do_step(tmp_path, "content", work)[1] is False and maps.read_text() == "own"
+    assert steps.do_step(tmp_path, "other", work)[1] is False
 
 
 def test_what_is_refused(tmp_path, relit):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from service.reporting.provenance import HASHING
+from service.reporting.provenance import HASHING, LIGHTS
 from service.requests.captures import ViewRequest
 from service.viewing import pixel_readings
 from service.viewing.view_files import view
@@ -253,8 +253,9 @@ def test_maps_of_other_images_give_no_samples_and_other_lights_no_model(tmp_path
     assert any("was solved from other images than the capture has" in finding for finding in found.facts["findings"])
     tmp_path = tmp_path / "gradient"  # among the lights
     write_dome(tmp_path / "cap", SURFACE, lights=5)
-    write_maps(tmp_path / "maps", SURFACE)
+    write_maps(tmp_path / "maps", SURFACE, provenance={LIGHTS: "others"})
     edit_frame(tmp_path / "cap", 0, light={"type": "gradient", "axis": "full"})
     found = show(tmp_path)
+    assert any("was solved with other lights than" in finding for finding in found.facts["findings"])
     assert found.facts["samples"]["model"] is None and found.facts["relight"] is None
     assert found.facts["findings"]  # relit info says what is wrong with such a mixture

@@ -132,6 +132,7 @@ def test_positions_without_a_width_are_directions(folder):
 
 @pytest.mark.parametrize(("content", "words"), [
     ("[1", r"rig\.dome: is not JSON"), ("[]", "must hold one JSON object"), (json.dumps({}), r"dome\.directions: is missing|images\[\]"),
+    (json.dumps(dome(lightConfiguration="lights3d", imageWidth=0, directions=[])), r"dome\.imageWidth: is not set"),
     (json.dumps(dome(directions=[{"x": 0, "y": 0, "z": 1}])), r"dome\.directions: has 1 entries for 4 images"),
     (json.dumps(dome(directions=[{"x": 0, "y": 0, "z": 0}] * 4)), r"led0\.png has no light direction: find it in RelightLab"),
     (json.dumps(dome(directions=[[0, 0, 1]] * 4)), r"dome\.directions: each must have the numbers x, y, z"),

@@ -7,11 +7,12 @@ import OpenEXR
 import pytest
 
 from stage.capture.camera import Camera, Distortion
+from stage.capture.capture import Capture
 from stage.errors import ImageError, ResultError
 from stage.formats import exr
 from stage.results.light_basis import facts_path, layer_types, numbers, write_facts, write_layers
-from stage.results.maps import LAYERS, SurfaceMaps
-from tests.scenes.captures import files_in
+from stage.results.maps import ALBEDO_SCALE, JOINED, LAYERS, SurfaceMaps, capture_as_solved
+from tests.scenes.captures import files_in, make_scene, write_capture
 
 ROWS, COLS = 5, 7
 RNG = np.random.default_rng(13)
@@ -163,3 +164,18 @@ def test_facts_lie_beside_and_hold_floats_as_they_are(tmp_path):
     assert facts["schema"] == "relit.basis/1" and facts["kind"] == "ptm"
     assert np.array_equal(np.array(facts["matrix"], dtype=np.float32), values) and np.float32(facts["one"]) == values[0, 0]
     assert files_in(tmp_path) == {"b.ptm.json"}
+
+
+def test_a_capture_is_at_the_distance_that_a_depth_has_placed(tmp_path):
+    capture, path = Capture.open(write_capture(tmp_path / "cap", make_scene(size=4, lights=3))), tmp_path / "maps.exr"
+    for provenance, placed in (({}, None), ({JOINED: "{}"}, -0.5)):
+        make_maps(provenance=provenance).write(path)
+        assert capture_as_solved(capture, path).camera.surface_z_m == placed
+
+
+@pytest.mark.parametrize("scale", ["0", "-2", "nan", "two"])
+def test_a_scale_that_none_can_be_is_refused(tmp_path, scale):
+    capture = Capture.open(write_capture(tmp_path / "cap", make_scene(size=4, lights=3)))
+    make_maps(provenance={ALBEDO_SCALE: scale}).write(tmp_path / "maps.exr")
+    with pytest.raises(ResultError, match=f"{ALBEDO_SCALE} is {scale}"):
+        capture_as_solved(capture, tmp_path / "maps.exr")

@@ -154,3 +154,13 @@ def test_an_image_that_is_not_that_of_its_phase_is_named(tmp_path, fault):
         images[5] = 0 if fault == "dark" else images[4]
     found = measured(tmp_path, images, settings)
     assert not found.maps.mask.any() and f"images of {40 if fault == 'exchanged' else 70} MHz are no wave" in found.warnings[0]
+
+
+def test_rows_that_an_image_lost_are_unsure(tmp_path):
+    """A sixth of one image is dark: the other three still make a range. Where the dark image would have read little, it is right."""
+    images, settings = under((20e6, 50e6))
+    images[1].reshape(ROWS, COLS)[60:] = 0
+    result = measured(tmp_path, images, settings)
+    far = np.abs(result.maps.range - VIEW.distance) > 5 * result.maps.sigma
+    assert result.maps.mask[:58].mean() > 0.95 and not (far & result.maps.mask)[60:].any()  # 27 % of these rows before
+    assert "no wave over their phases, as where rows" in result.warnings[0]
