@@ -31,10 +31,10 @@ SETTLED = np.radians(0.001)
 """Change of a turn after which no more is looked for."""
 PRIOR, SUREST = 0.3, 2e-3
 """Standard deviation of turns (rad) and shears, which matters where a surface leaves some of them open, and of the surest slopes."""
-LEAST_SQUARE, LEAST_SQUARE_STRICT = 50.0, 1000.0
-"""Least square of a turn over its covariance: a turn of 5° has 60 to 1000 on real objects and noisy matt scenes, and thousands on
-other matt ones. Right captures have up to 60, of broad highlights under lights from one side up to 500, and 240 under fewer than eight
-lights, where shadows and highlights, taken for shading, bend whole regions."""
+LEAST_SQUARE, LEAST_SQUARE_STRICT = 100.0, 1000.0
+"""Least square of a turn over its covariance: a turn of 5° has 100 to 3500 on real objects and noisy matt scenes, and thousands on
+other matt ones. Right captures have up to 60, where light bounces up to 94, of broad highlights under lights from one side up to 500, and
+240 under fewer than eight lights, where shadows and highlights, taken for shading, bend whole regions."""
 LARGEST_SIGMA = np.radians(1.5)
 """Largest standard deviation of a turn about an axis: slopes that tell turns less well are bent by what the model lacks, and say more than
 they know."""
