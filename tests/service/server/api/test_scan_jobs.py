@@ -14,7 +14,7 @@ from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.scenes.register import seen
 from tests.scenes.turntable import figure
-from tests.service.joining.test_depth_and_normals import write
+from tests.service.joining.test_join import write
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 
 pytestmark = pytest.mark.long
