@@ -62,8 +62,7 @@ def relief_shift_px(height: np.ndarray, sigma: np.ndarray, base: np.ndarray, kno
                     drifts: Sequence[np.ndarray] = ()) -> tuple[float, float]:
     """Return by how many pixels a depth lies to the right and down against normals; 0 where it is not sure. What a polynomial over the part
     explains is drift, and so is any of `drifts`, [rows, cols] each; the other arguments are those of `relief_factor`."""
-    gentle = np.hypot(*(np.gradient(base, axis=axis) if base.shape[axis] > 1 else np.zeros(base.shape) for axis in (1, 0))) < GENTLE
-    at = _pixels(base, known & gentle, part)
+    at = _pixels(base, known & (np.hypot(*_slopes(base)) < GENTLE), part)
     if at is None:
         return 0.0, 0.0
     x, y = (2 * (place - place.min()) / max(np.ptp(place), 1) - 1 for place in (at.cols, at.rows))
@@ -75,9 +74,14 @@ def relief_shift_px(height: np.ndarray, sigma: np.ndarray, base: np.ndarray, kno
     return shift if sure and np.hypot(*shift) < MOST_SHIFT_PX else (0.0, 0.0)
 
 
+def _slopes(base: np.ndarray) -> list[np.ndarray]:
+    """Return by how much heights rise from pixel to pixel to the right, and down."""
+    return [np.gradient(base, axis=axis) if base.shape[axis] > 1 else np.zeros(base.shape) for axis in (1, 0)]
+
+
 def _pixels(base: np.ndarray, known: np.ndarray, part: np.ndarray) -> _Pixels | None:
     """Return the pixels that are compared; None where there are too few."""
-    slope = [np.gradient(base, axis=axis) if base.shape[axis] > 1 else np.zeros(base.shape) for axis in (1, 0)]
+    slope = _slopes(base)
     inside = known.copy()
     for axis in (0, 1):  # slopes across a step are none
         for way in (1, -1):

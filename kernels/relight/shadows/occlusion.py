@@ -13,8 +13,8 @@ from kernels.packs import pack_type
 from kernels.relight.model.shading import Surface
 from kernels.surface.shadows import NO_REACH, Extent, Projection, Relief, in_shadow_within, relief_of, surface_point
 
-LEAST_FACING = 0.1
-"""Least n·l at which a pixel tells whether the surface hides a light: steps of the height hide it from pixels that it grazes."""
+GRAZING = 0.1
+"""The n·l up to which a pixel does not tell whether the surface hides a light: steps of the height hide it from pixels that it grazes."""
 
 
 def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
@@ -82,7 +82,7 @@ def _see_kernel(pack: int) -> Any:
                 reach = wp.length(toward)
                 toward = toward / wp.max(reach, 1.0e-20)
             hidden = bool(False)
-            if normals.shape[0] == 0 or nx[k] * toward[0] + ny[k] * toward[1] + nz[k] * toward[2] > LEAST_FACING:
+            if normals.shape[0] == 0 or nx[k] * toward[0] + ny[k] * toward[1] + nz[k] * toward[2] > GRAZING:
                 hidden = in_shadow_within(relief, row, col, toward, reach)
             out[k] = wp.where(hidden, wp.uint8(0), wp.uint8(255))
         visible[light, p] = out

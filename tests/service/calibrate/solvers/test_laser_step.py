@@ -30,7 +30,7 @@ def stripe(step, normal, riser):
 
 @pytest.mark.parametrize("aside", [0, 2])
 def test_stripes_that_rise_on_another_face_do_not_count_as_its_edge(aside):
-    """Of seven stripes two cross the corner of the block, for which the solver refused it as leaning. Lines are exact, and planes as good
+    """Two of seven stripes cross the corner of the block; for them the solver refused it as leaning. Lines are exact, and planes as good
     as the solver's last step."""
     step, planes = Step(), laser_planes(7)
     other = step.facing + 0.9 * np.cross(step.normal, step.facing)
