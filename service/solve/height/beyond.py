@@ -1,7 +1,8 @@
 """The light that may reach an object from what lies beyond the image.
 
-A surface that goes on beyond the border of the image throws light on what the image shows, and nothing says how much. What the mirror image
-of the surface at the border would throw is a measure of it.
+A surface that goes on beyond the border of the image throws light on what the image shows, and nothing says how much. It may end there; it
+may go on as its mirror image at the border, whose slopes are the opposite ones; or as itself turned by half a turn about the border, whose
+slopes are the same. A valley that the border cuts is lit by the first of these, a wall that rises towards the border by the second.
 """
 
 from typing import NamedTuple
@@ -13,6 +14,12 @@ from service.solve.height.height import projection_of
 from service.solve.height.interreflection import Patches
 from stage.capture.camera import Camera
 
+MIRRORED, TURNED = 1, 2
+"""Numbers of the ways in which a surface goes on beyond a border; 0 is that it ends there."""
+LIKELY = np.array([0.25, 0.15, 0.6])
+"""Likelihood of each of these. Near a border slopes are kept; with these shares normals of path-traced folds, whole and cut out of larger
+ones, and of parts of a real cat are nearest to the truth together: light of mirror images alone helps folds and bends the round cat."""
+
 
 class Border(NamedTuple):
     """One of the four borders of an image."""
@@ -21,6 +28,22 @@ class Border(NamedTuple):
     """0 for the top and bottom borders, which rows cross, 1 for the left and right ones."""
     last: bool
     """Whether it is that of the last row or column."""
+
+    def mirrored(self, patches: Patches, camera: Camera, directions: np.ndarray) -> Patches:
+        """Return the mirror image of a surface at the border. `directions`: [lights, 3] to the lights."""
+        mirror = self.mirror(camera)
+        seen = (directions @ mirror.turned(directions).T).argmax(axis=0)
+        return patches._replace(centres=mirror.mirrored(patches.centres), facing=mirror.turned(patches.facing),
+                                radiance=patches.radiance[:, :, seen])
+
+    def turned(self, patches: Patches) -> Patches:
+        """Return a surface that goes on with the slopes it has: each row or column of patches that crosses the border is turned by half a
+        turn about the point where it does. Centres are NaN where none does."""
+        grid = np.moveaxis(patches.numbers, self.axis, 0)[:: -1 if self.last else 1]
+        outer, inner = grid[0], grid[min(1, len(grid) - 1)]
+        at = np.where((outer >= 0)[:, None], patches.centres[outer], np.nan)
+        at = np.where((inner >= 0)[:, None], 1.5 * at - 0.5 * patches.centres[inner], at)
+        return patches._replace(centres=2 * at[patches.cells[:, 1 - self.axis]] - patches.centres)
 
     def mirror(self, camera: Camera) -> "Mirror":
         """Return the plane of the lines of sight at the border."""
@@ -49,26 +72,23 @@ class Mirror(NamedTuple):
 
 
 def light_from_beyond(patches: Patches, camera: Camera, directions: np.ndarray, height: wp.array, solved: np.ndarray) -> np.ndarray | None:
-    """Return the light that mirror images of a surface beyond the borders that it reaches would throw on each patch of it,
-    [patches, 3, lights] as of `ArrivingLight`, or None where it reaches no border.
-    `directions`: [lights, 3] to the lights. `height`: [rows, cols] float32 on the device. `solved`: [rows, cols] bool, the surface.
+    """Return the light that a surface would throw on each patch of itself from beyond the borders that it reaches, [3, patches, 3, lights]
+    as of `ArrivingLight`: were it to end there, to go on as its mirror image, and as itself turned about the border. None where it reaches
+    no border. `directions`: [lights, 3] to the lights. `height`: [rows, cols] float32 on the device. `solved`: [rows, cols] bool, the
+    surface.
 
-    A mirror image under a light looks as the surface does under the mirrored light, or the one next to that."""
+    A mirror image under a light looks as the surface does under the mirrored light, or the one next to that; what keeps its slopes looks
+    as it does."""
     borders = [border for border in (Border(axis, last) for axis in (0, 1) for last in (False, True))
                if np.take(solved, -border.last, border.axis).any()]
     if not borders:
         return None
-    light = np.zeros_like(patches.radiance)
+    light = np.zeros((3, *patches.radiance.shape), patches.radiance.dtype)
     for border in borders:
         along = np.take(solved, -border.last, border.axis)  # where the surface reaches it, by pixel
         reached = np.logical_or.reduceat(along, np.arange(0, len(along), patches.side))
-        some = reached[patches.cells[:, 1 - border.axis]]
-        if not some.any():  # too little of a patch reaches it
-            continue
-        mirror = border.mirror(camera)
-        seen = (directions @ mirror.turned(directions).T).argmax(axis=0)
-        mirrored = patches._replace(
-            centres=mirror.mirrored(patches.centres[some]), facing=mirror.turned(patches.facing[some]),
-            areas=patches.areas[some], cells=patches.cells[some], radiance=patches.radiance[some][:, :, seen])
-        light += mirrored.light_on(patches, height, projection_of(camera))
+        for way, goes_on in ((MIRRORED, border.mirrored(patches, camera, directions)), (TURNED, border.turned(patches))):
+            some = np.flatnonzero(reached[patches.cells[:, 1 - border.axis]] & np.isfinite(goes_on.centres).all(axis=1))
+            if len(some):  # else too little of a patch reaches it
+                light[way] += goes_on.some(some).light_on(patches, height, projection_of(camera))
     return light

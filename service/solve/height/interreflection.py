@@ -58,6 +58,10 @@ class ArrivingLight(NamedTuple):
         total = np.sum(shares, axis=0)
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
 
+    def brighter(self, by: np.ndarray) -> "ArrivingLight":
+        """Return this with more light, [patches, 3, lights]."""
+        return self._replace(light=self.light + by)
+
     def mean_at(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return the mean over all lights and channels of the light that arrives at n pixels, [n]."""
         corners, shares = self.at(rows, cols)
@@ -76,6 +80,11 @@ class Patches(NamedTuple):
     side: int
     """Pixels along a side of a patch."""
     mask: wp.array  # [rows, cols] uint8 of the image, on the device: where their surface is
+
+    def some(self, at: np.ndarray) -> "Patches":
+        """Return some of these, by their numbers."""
+        return self._replace(centres=self.centres[at], facing=self.facing[at], areas=self.areas[at], cells=self.cells[at],
+                             radiance=self.radiance[at])
 
     def light_on(self, others: "Patches | None", height: wp.array, projection: Projection) -> np.ndarray:
         """Return the light of these that arrives at others, or at each of them where None, [patches, 3, lights] as of `ArrivingLight`.

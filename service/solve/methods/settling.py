@@ -22,7 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
-from service.solve.height.beyond import light_from_beyond
+from service.solve.height.beyond import LIKELY, light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.height import projection_of
 from service.solve.height.interreflection import patches_of
@@ -62,8 +62,6 @@ LEAST_FALL = 0.03
 UNKNOWN_STRENGTH = 0.5
 """Relative error of the strength where shadows do not tell it: 1.2 to 2.5 times the light of the form factors arrives in glossy folds, and
 1.0 to 1.2 times in matt ones."""
-BEYOND = 3**-0.5
-"""Standard deviation of the light from beyond the image, as a part of that from the mirror image: anything up to that is as likely."""
 TOLD_DEGREES = 3.0
 """Turn by light from beyond the image from which on it is said: it is 1.7 to 8.5° in folds that fill the image."""
 NEIGHBOURS = 5
@@ -189,7 +187,8 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     solved, block, middles, whole = within
     pixels = np.flatnonzero(solved)
     first, albedo, start, camera = normal, light.albedo, normal[:, middles].T, light.given.camera
-    turned = start
+    directions, turned = light.lights.direction[:light.given.stack.light_count], start
+    beyond: np.ndarray | None = None
 
     def with_strength() -> tuple[DirectLight, ScaleFit | None]:
         """Return the light with the strength that shadows and lit readings show now, and the fit by shadows."""
@@ -210,24 +209,26 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         patches = patches_of(light.given, light.lights, again, light.height, solved)
-        arriving = None if patches is None else patches.arriving(light.height, projection_of(camera))
-        light = light._replace(arriving=arriving, albedo=dimmed)
+        light = light._replace(arriving=None, albedo=dimmed)
+        if patches is not None:
+            arriving = patches.arriving(light.height, projection_of(camera))
+            beyond = light_from_beyond(patches, camera, directions, light.height, solved)
+            light = light._replace(arriving=arriving if beyond is None else arriving.brighter(np.tensordot(LIKELY, beyond, 1)))
         cost = _cost_of(light, middles, turned, shape, pick)
     settled, fit = with_strength()
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
-    doubted = [(1.0, settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale))]
-    directions = light.lights.direction[:light.given.stack.light_count]
-    beyond = None if patches is None else light_from_beyond(patches, camera, directions, light.height, solved)
+    doubted = [settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale)]
     if beyond is not None:
         assert settled.arriving is not None
-        doubted.append((BEYOND, settled._replace(arriving=settled.arriving._replace(light=settled.arriving.light + beyond))))
-    now, *others = (_searched(each, middles, turned, shape, pick)[1].normal for each in (settled, *(each for _, each in doubted)))
+        doubted += [settled._replace(arriving=settled.arriving.brighter(way - np.tensordot(LIKELY, beyond, 1))) for way in beyond]
+    now, *others = (_searched(each, middles, turned, shape, pick)[1].normal.T for each in (settled, *doubted))
     places = np.stack(np.divmod(middles, camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
-    by = [part * np.median(degrees_between(now.T, other.T)[nearest], axis=1) for (part, _), other in zip(doubted, others, strict=True)]
+    strength, *ways = (np.median(degrees_between(now, other)[nearest], axis=1) for other in others)
+    goes_on = np.sqrt(LIKELY @ np.square(ways)) if ways else np.zeros(len(middles))
     degrees = np.zeros(solved.size, np.float32)
-    degrees[pixels] = np.linalg.norm(by, axis=0)[block]
-    return Settled(settled, None, True, fit, degrees, None if beyond is None else float(np.percentile(by[1], 95)))
+    degrees[pixels] = np.hypot(strength, goes_on)[block]
+    return Settled(settled, None, True, fit, degrees, float(np.percentile(goes_on, 95)) if ways else None)
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
