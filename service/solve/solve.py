@@ -201,13 +201,13 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
 
 
 def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera) -> None:
-    """Add to σ what the surface shows of errors that neighbours share."""
+    """Raise σ to what the surface shows of errors, which the fit says as well but not of those that neighbours share."""
     assert solution.shared_misfit is not None and solution.height is not None
     shape, found = estimated.shape, _part_numbers(solution)
     part = np.where(estimated, 1 if found is None else found, 0)
     normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
-    shown = np.hypot(solution.standard_error().reshape(shape),
-                     integrability.doubt(normal, solution.height, part, camera, shared=solution.shared_misfit))
+    shown = np.maximum(solution.standard_error().reshape(shape),
+                       integrability.doubt(normal, solution.height, part, camera, shared=solution.shared_misfit))
     sigma = integrability.beside_parts(shown, part).reshape(-1)
     solution.sigma = np.where(np.isin(solution.status, ESTIMATED), sigma, solution.sigma).astype(np.float16)
 

@@ -16,9 +16,9 @@ from stage.capture.camera import Camera
 
 MIRRORED, TURNED = 1, 2
 """Numbers of the ways in which a surface goes on beyond a border; 0 is that it ends there."""
-LIKELY = np.array([0.25, 0.15, 0.6])
-"""Likelihood of each of these. Near a border slopes are kept; with these shares normals of path-traced folds, whole and cut out of larger
-ones, and of parts of a real cat are nearest to the truth together: light of mirror images alone helps folds and bends the round cat."""
+LIKELY = np.array([0.4, 0.1, 0.5])
+"""Likelihood of each of these. Near a border slopes are kept, and mirror images alone bend what is round: with these shares, normals of
+path-traced folds that end soon behind the image or go on far, and of parts of a real cat, are nearest to the truth together."""
 
 
 class Border(NamedTuple):

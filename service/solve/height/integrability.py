@@ -28,14 +28,14 @@ BAND_PIXELS = 1 << 19
 """Number of pixels that are looked at in one piece: it bounds the memory."""
 MOST_BANDS = 4
 """Most pieces at one time, of which each takes some hundred MB."""
-BENT = 7.0
+BENT = 11.0
 """Standard deviation of normals over their mean misfit, less 1, for each share of the residuals that neighbouring pixels have in common:
 errors that neighbours share bend a surface, and are mostly those of another surface. Measured on path-traced scenes and real objects."""
 LEAST_COUNT = 1e-4
 """Least weight of all pixels around one at which their misfit is looked at."""
 STEEP = np.radians(3.0)
 """Change of the normal from pixel to pixel at which a pixel counts half: where it is larger, differences of heights hardly show normals."""
-LARGEST_TRACE = 5.0
+LARGEST_TRACE = 8.0
 """Standard deviation, in degrees, that the misfit tends to where it is large: there it is of a texture of many degrees from pixel to pixel
 more than of errors."""
 PIXEL = 0.03

@@ -225,7 +225,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     places = np.stack(np.divmod(middles, camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
     strength, *ways = (np.median(degrees_between(now, other)[nearest], axis=1) for other in others)
-    goes_on = np.sqrt(LIKELY @ np.square(ways)) if ways else np.zeros(len(middles))
+    goes_on = np.sqrt(np.mean(np.square(ways), axis=0)) if ways else np.zeros(len(middles))
     degrees = np.zeros(solved.size, np.float32)
     degrees[pixels] = np.hypot(strength, goes_on)[block]
     return Settled(settled, None, True, fit, degrees, float(np.percentile(goes_on, 95)) if ways else None)
