@@ -63,6 +63,11 @@ class DirectLight(NamedTuple):
         solved, height = (wp.array(to_numpy(plane), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
         return self._replace(solved=solved, height=height, arriving=arriving)
 
+    def with_more(self, light: np.ndarray) -> "DirectLight":
+        """Return the same with more light that arrives, [patches, 3, lights]."""
+        assert self.arriving is not None
+        return self._replace(arriving=self.arriving._replace(light=self.arriving.light + light))
+
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
         """Change readings in place: mark those in cast shadow as none, and subtract the light that the object threw on itself from the
         others."""

@@ -58,10 +58,6 @@ class ArrivingLight(NamedTuple):
         total = np.sum(shares, axis=0)
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
 
-    def brighter(self, by: np.ndarray) -> "ArrivingLight":
-        """Return this with more light, [patches, 3, lights]."""
-        return self._replace(light=self.light + by)
-
     def mean_at(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return the mean over all lights and channels of the light that arrives at n pixels, [n]."""
         corners, shares = self.at(rows, cols)

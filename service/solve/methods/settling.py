@@ -22,7 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
-from service.solve.height.beyond import LIKELY, light_from_beyond
+from service.solve.height.beyond import ENDS, by_cost, light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.height import projection_of
 from service.solve.height.interreflection import patches_of
@@ -190,7 +190,7 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
     directions, turned = light.lights.direction[:light.given.stack.light_count], start
     beyond: np.ndarray | None = None
 
-    def with_strength() -> tuple[DirectLight, ScaleFit | None]:
+    def with_strength(light: DirectLight, cost: Callable[[float], float]) -> tuple[DirectLight, ScaleFit | None]:
         """Return the light with the strength that shadows and lit readings show now, and the fit by shadows."""
         fit = fit_albedo_scale(*readings_in_shadow(light, middles, turned, whole))
         if relative:
@@ -201,26 +201,32 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         fit = fit._replace(scale=min(fit.scale, LARGEST_STRENGTH))
         return light._replace(albedo_scale=fit.scale if lit is None else max(fit.scale, (fit.scale + lit) / 2)), fit
 
+    def shown_beyond(light: DirectLight, ways: np.ndarray) -> np.ndarray:
+        """Return the likelihood of each of `ways` to go on beyond the image, by what lit readings cost with its light."""
+        costs = []
+        for each in (light.with_more(way) for way in ways):
+            cost = _cost_of(each, middles, turned, shape, pick)
+            costs.append(cost(with_strength(each, cost)[0].albedo_scale))
+        return by_cost(np.array(costs))
+
     for _ in range(ROUNDS):
-        light, _ = with_strength()
+        light, _ = with_strength(light, cost)
         samples, found = _searched(light, middles, start, shape, pick)
         turned = found.normal
         again, dimmed = first.copy(), albedo.copy()
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         patches = patches_of(light.given, light.lights, again, light.height, solved)
-        light = light._replace(arriving=None, albedo=dimmed)
-        if patches is not None:
-            arriving = patches.arriving(light.height, projection_of(camera))
-            beyond = light_from_beyond(patches, camera, directions, light.height, solved)
-            light = light._replace(arriving=arriving if beyond is None else arriving.brighter(np.tensordot(LIKELY, beyond, 1)))
+        light = light._replace(arriving=None if patches is None else patches.arriving(light.height, projection_of(camera)), albedo=dimmed)
+        beyond = None if patches is None else light_from_beyond(patches, camera, directions, light.height, solved)
+        if beyond is not None:
+            beyond -= np.tensordot(shown_beyond(light, beyond), beyond, 1)
+            light = light.with_more(-beyond[ENDS])
         cost = _cost_of(light, middles, turned, shape, pick)
-    settled, fit = with_strength()
+    settled, fit = with_strength(light, cost)
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
     doubted = [settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale)]
-    if beyond is not None:
-        assert settled.arriving is not None
-        doubted += [settled._replace(arriving=settled.arriving.brighter(way - np.tensordot(LIKELY, beyond, 1))) for way in beyond]
+    doubted += [] if beyond is None else [settled.with_more(way) for way in beyond]
     now, *others = (_searched(each, middles, turned, shape, pick)[1].normal.T for each in (settled, *doubted))
     places = np.stack(np.divmod(middles, camera.width), axis=1)
     nearest = cKDTree(places).query(places, k=range(1, min(NEIGHBOURS, len(places)) + 1))[1]
