@@ -1,8 +1,11 @@
 /** Views, which jobs of the kind `view` prepare: of a capture, or of the maps that a job has made. */
 
-import { listing, read, resultsOf, submitJob } from "./api.js";
+import { listing, read, resultsOf, reveal, submitJob } from "./api.js";
 import { element } from "./element.js";
 import { watch } from "./events.js";
+import { doingOf } from "./jobs_table.js";
+
+const PRIORITY = 75; // of a view that somebody waits for: before what is queued as usual, at 50
 
 /**
  * Return the newest view of a capture or of maps that is prepared or being prepared; null: there is none.
@@ -36,14 +39,14 @@ export async function captureOf(job) {
  * @returns {Promise<{job: any, files: ReturnType<typeof resultsOf>}>}
  */
 export async function openView(capture, maps, step, place, more = {}) {
-  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }), ...more };
+  const body = { kind: "view", priority: PRIORITY, capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }), ...more };
   let job = (await findView({ capture, maps, step })) ?? (await submitJob(body));
   job = await followed(job, place, "This is looked at for the first time: its view is being prepared.", "the view was not prepared");
   return { job, files: resultsOf(job.id) };
 }
 
 /**
- * Return a job when it has succeeded; a place of the page shows how far it is until then.
+ * Return a job when it has succeeded; a place of the page shows how far it is until then, beside what else is here of the page.
  * @param {string} doing A sentence that says what is done. @param {string} fault What is said where it fails, before the reason.
  */
 export async function followed(job, place, doing, fault) {
@@ -51,6 +54,7 @@ export async function followed(job, place, doing, fault) {
     const [bar, stage] = [element("progress", { "aria-label": "Progress of the preparation" }), element("span")];
     const told = element("div", { class: "preparing" }, element("p", { role: "status" }, doing), bar, " ", stage);
     place.prepend(told);
+    reveal();
     try {
       await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now, bar, stage); } });
       job = await read(`/v1/jobs/${job.id}`);
@@ -65,12 +69,7 @@ export async function followed(job, place, doing, fault) {
 }
 
 function progress(job, bar, stage) {
-  if (job.progress === null) {
-    bar.removeAttribute("value");
-    stage.textContent = job.state;
-    return;
-  }
-  bar.max = Math.max(job.progress.total, 1);
-  bar.value = job.progress.done;
-  stage.textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}`;
+  if (job.progress === null) bar.removeAttribute("value");
+  else Object.assign(bar, { max: Math.max(job.progress.total, 1), value: job.progress.done });
+  stage.textContent = doingOf(job);
 }

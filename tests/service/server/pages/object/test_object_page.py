@@ -110,6 +110,70 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
     expect(page.get_by_text("its view is being prepared")).to_be_hidden()
 
 
+def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_page, solved):
+    """It is being checked at first. What asks for a job rests while such a job is under way."""
+    page, states, submitted = small_page, ["checking", "ready"], []
+
+    def unprepared(route):
+        answer = route.fetch()
+        found = answer.json()
+        route.fulfill(response=answer, json={**found, "jobs": [{**job, "state": "queued"} for job in found["jobs"]]})
+
+    def unseen(route):
+        answer = route.fetch()
+        route.fulfill(response=answer, json={**answer.json(), "view": None, "state": states.pop(0) if states else "ready"})
+
+    def submit(route):
+        submitted.append(route.request.post_data_json)
+        route.fulfill(status=202, json=waiting)
+
+    with solved.server.client() as client:
+        job = client.get(f"/v1/jobs/{solved.solve}").json()
+    waiting = {**job, "state": "queued", "request": {"kind": "pipeline", "capture": solved.capture}}
+    page.route("**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", unprepared)
+    page.route("**/v1/jobs?limit=500&state=succeeded", lambda route: route.fulfill(json={"jobs": [], "next": None}))
+    page.route(f"**/v1/captures/{solved.capture}", unseen)
+    page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
+    page.route("**/v1/events", lambda route: None)
+    page.route("**/v1/jobs", submit)
+    page.goto(solved.pages["object"])
+    page.get_by_text("This capture is being checked.").wait_for()
+    page.get_by_text("its view is being prepared").wait_for()
+    asset = page.get_by_role("button", name="Make an asset")
+    asset.click()
+    page.locator("#work li", has_text="waits for a free worker").wait_for()
+    expect(asset).to_be_disabled()
+    assert [each["kind"] for each in submitted] == ["pipeline"]
+    page.goto(solved.pages["capture"])
+    page.get_by_text("its view is being prepared").wait_for()
+    expect(page.get_by_role("button", name="Solve normals and materials")).to_be_visible()
+    expect(page.locator("#facts")).to_be_visible()
+
+
+def test_maps_are_exported_without_another_solve(small_page, made):
+    page, submitted = small_page, []
+
+    def without_assets(route):
+        answer = route.fetch()
+        found = answer.json()
+        route.fulfill(response=answer, json={**found, "jobs": [job for job in found["jobs"] if job["request"]["kind"] != "export"]})
+
+    def submit(route):
+        submitted.append(route.request.post_data_json)
+        route.fulfill(status=503, json={"detail": "the service takes no jobs now"})
+
+    page.goto(f"{made.pages['object']}#mode=photographs")
+    page.locator("#save a").wait_for()
+    expect(page.locator("#next button:visible")).to_have_count(0)  # the newest maps have an asset
+    page.route("**/v1/jobs?limit=500&state=succeeded", without_assets)
+    page.route("**/v1/jobs", submit)
+    page.reload()
+    page.get_by_role("button", name="Export an asset").click()
+    newest = seen(page, lambda: submitted, "nothing is submitted")[0]
+    assert newest == {"kind": "export", "maps": newest["maps"]} and newest["maps"] != made.solve
+    expect(page.get_by_role("button", name="Make an asset")).to_be_hidden()
+
+
 def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(server, small_page, made):
     with server.client() as client:
         jobs = client.get("/v1/jobs", params={"limit": 500, "kind": "export"}).json()["jobs"]
@@ -192,6 +256,24 @@ def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made)
     page.reload()
     page.locator("[data-shows=compare] canvas.map").wait_for()
     expect(how).to_have_value("beside")
+    page.get_by_label("Layer", exact=True).select_option("sigma")
+    expect(page.get_by_label("Compare with", exact=True)).to_have_value("0/sigma")
+    page.get_by_label("Highest value that is shown").fill("1")
+
+    def brightest() -> bool:
+        """Return whether both show what lies above the highest value in the last colour of viridis, but for edges and hatching."""
+        shares = page.locator("canvas.map").evaluate("""(canvas) => {
+          const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height), counts = [[0, 0], [0, 0]];
+          for (let at = 0; at < data.length; at += 4) {
+            if (data[at + 3] < 255 || Math.abs(data[at] - data[at + 1]) + Math.abs(data[at] - data[at + 2]) < 60) continue;
+            const half = counts[(at / 4) % canvas.width < canvas.width / 2 ? 0 : 1];
+            half[Number(data[at] > 240 && data[at + 1] > 220)] += 1;
+          }
+          return counts.map(([others, yellow]) => yellow / (others + yellow));
+        }""")
+        return min(shares) > 0.9
+
+    seen(page, brightest, "the two are shown by different ranges")
 
 
 def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):

@@ -114,12 +114,16 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     over = overSelect.value === NONE ? null : new TiledImage(view, view.layer(overSelect.value), draw, failed);
     over?.setLook({ veil: over.layer.name === "confidence" ? "low" : "high" });
     for (const each of [image, other]) each?.setLook(look);
+    const alike = other?.layer.name === image.layer.name ? [image, other] : [image]; // what is compared is shown alike
+    const { low, high } = image.look;
+    const codes = [...new Set(alike.flatMap(({ layer }) => layer.range))].sort((one, two) => one - two);
+    for (const each of alike) each.setLook({ low, high, codes });
     const kinds = [image, other].map((each) => each?.layer.kind);
     colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
     stopsRow.hidden = !kinds.includes("colour");
     howRow.hidden = other === null;
     wipeRow.hidden = other === null || how.value !== "wipe";
-    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
+    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => alike.forEach((each) => each.setLook(range)));
     if (over === null) overHistogram.replaceChildren();
     else mountHistogram(overHistogram, over.layer, view.info.codes, over.look, (range) => over.setLook(range), " by the grey");
     draw();
@@ -183,6 +187,10 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   address.read();
   for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
+  layerSelect.addEventListener("input", () => { // another solve is compared layer by layer
+    const [at, name] = otherSelect.value.split("/");
+    if (name === image.layer.name && others[at].view.layer(layerSelect.value) !== undefined) otherSelect.value = `${at}/${layerSelect.value}`;
+  });
   for (const each of [layerSelect, otherSelect, overSelect, how]) each.addEventListener("change", select);
   how.addEventListener("change", () => map.fit());
   wipe.addEventListener("input", draw);
