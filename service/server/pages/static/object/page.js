@@ -144,9 +144,13 @@ await load(async () => {
     const [view, now] = await Promise.all([viewing, jobsOfObject()]);
     if (!isNewest()) return; // another job has ended meanwhile, and its look sees both
     const facts = litFacts(capture.facts ?? {}, view);
-    takeModes(modesOf(identifier, view, step, now, facts, environments));
+    takeModes(modesOf(identifier, view, step, now, facts, environments, renders));
     await present(now, facts, work);
   });
+  const renders = (job) => {
+    followJob(work, job);
+    byId("work").scrollIntoView({ block: "center" });
+  };
   const presentAll = (facts) => attempt(async () => {
     await present(jobs, facts, work);
     for (const job of await jobsUnderWay(isOfObject)) followJob(work, job);
@@ -154,7 +158,7 @@ await load(async () => {
   const early = capture.view === null ? presentAll(capture.facts ?? {}) : null; // its view is prepared first, which may wait for other jobs
   const view = await viewing;
   const facts = litFacts(capture.facts ?? {}, view);
-  takeModes(modesOf(identifier, view, step, jobs, facts, environments));
+  takeModes(modesOf(identifier, view, step, jobs, facts, environments, renders));
   const wanted = { mode: "" };
   address.read(wanted);
   const first = wanted.mode in modes ? wanted.mode : Object.keys(modes)[0];

@@ -276,6 +276,16 @@ def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made)
     seen(page, brightest, "the two are shown by different ranges")
 
 
+def test_the_maps_of_any_solve_are_shown(page, made):
+    page.goto(f"{made.pages['object']}#mode=maps")
+    chosen = page.get_by_label("Maps of")
+    expect(chosen.locator("option")).to_have_text([re.compile(r"^<i>other \("), re.compile(r"^lambert \(")])
+    page.locator("canvas.map").wait_for()
+    with page.expect_response(f"**/v1/jobs/{made.solve}"):
+        chosen.select_option(index=1)
+    page.locator("canvas.map").wait_for()
+
+
 def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):
     page.goto(made.pages["light"])
     made.wait_for_content(page, "light")

@@ -210,9 +210,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
       change();
       return;
     }
-    const [x, y, z] = place.light;
-    const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
-    move([x * cos - y * sin, x * sin + y * cos, z]); // around the view axis, so that it stays among the captured lights
+    move(turnedAside(place.light, degrees));
   }
 
   drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
@@ -296,6 +294,12 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     over: { ...zoomed.over, step: relight.step },
     turn,
   };
+}
+
+/** Return a direction turned around the view axis, so that a light stays among the captured ones. */
+export function turnedAside([x, y, z], degrees) {
+  const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
+  return [x * cos - y * sin, x * sin + y * cos, z];
 }
 
 function decoded(value) {

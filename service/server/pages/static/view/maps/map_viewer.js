@@ -182,9 +182,9 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     event.preventDefault();
     keys[event.key]();
   });
-  if (others.length > 0) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
   const address = new ControlAddress({ layer: layerSelect, with: otherSelect, over: overSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
-  address.read();
+  const given = address.read();
+  if (others.length > 0 && !given.includes("with")) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
   for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
   layerSelect.addEventListener("input", () => { // another solve is compared layer by layer
