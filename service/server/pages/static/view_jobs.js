@@ -5,6 +5,7 @@ import { element } from "./element.js";
 import { watch } from "./events.js";
 import { doingOf } from "./jobs_table.js";
 
+const CHECKED_MS = 500; // between two looks at a capture that is being checked
 const PRIORITY = 75; // of a view that somebody waits for: before what is queued as usual, at 50
 
 /**
@@ -19,6 +20,16 @@ export async function findView(wanted) {
     if ((wanted.maps === undefined || wanted.maps === maps) && (wanted.step === undefined || wanted.step === step)) return job;
   }
   return null;
+}
+
+/** Return a capture when nothing checks it any more; `tell` is given it as it is until then. */
+export async function checked(id, tell) {
+  for (;;) {
+    const capture = await read(`/v1/captures/${id}`);
+    if (capture.state !== "checking") return capture;
+    tell(capture);
+    await new Promise((resolve) => { setTimeout(resolve, CHECKED_MS); });
+  }
 }
 
 /** Return the capture that a job comes from, by its maps if it names none; null where none is known. */

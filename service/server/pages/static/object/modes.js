@@ -51,7 +51,7 @@ async function mountOne(parent, title, jobs, mount) {
   const holder = element("div");
   const chosen = element("select", {}, ...jobs.map((job) => element("option", {}, nameOf(job))));
   const show = () => {
-    const place = element("div"); // of its own: what comes late of another job is not seen
+    const place = element("div", {}, element("p", { class: "help", role: "status" }, "Loading …")); // of its own: what comes late of another job is not seen
     holder.replaceChildren(place);
     return mount(place, jobs[chosen.selectedIndex]);
   };

@@ -1,13 +1,13 @@
 /** The page of one object: what was captured and what was made of it, as modes of one view. Its address says which is shown, and how. */
 
-import { attempt, listing, load, read, reveal, submitJob } from "../api.js";
+import { attempt, listing, load, reveal, submitJob } from "../api.js";
 import { byId, element, factRows, show } from "../element.js";
 import { readyEnvironments } from "../environments.js";
 import { Address, writeNow } from "../publish/address.js";
 import { newest, once } from "../once.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
-import { openView } from "../view_jobs.js";
+import { checked, openView } from "../view_jobs.js";
 import { newestFiles, presentFiles, presentReport, savingLink } from "./files.js";
 import { offerFusion } from "./fusion.js";
 import { modesOf } from "./modes.js";
@@ -19,7 +19,6 @@ import { jobsUnderWay, Work } from "./work.js";
 const identifier = byId("main").dataset.identifier;
 const MADE_BY = { pipeline: ["solve"], solve: ["pipeline"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
 const EXPORTED = ["maps.exr", "points.ply"]; // files of the jobs that an asset can be made of
-const CHECKED_MS = 500; // between two looks at a capture that is being checked
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
 const known = new Set(); // jobs of this object that have succeeded
@@ -120,15 +119,13 @@ async function followJob(work, job) {
 }
 
 await load(async () => {
-  let [capture, jobs, environments] = await Promise.all([read(`/v1/captures/${identifier}`), jobsOfObject(), readyEnvironments()]);
-  byId("name").textContent = capture.name;
-  document.title = `${capture.name} · Relit`;
-  while (capture.state === "checking") {
+  const isChecked = () => {
     byId("view").replaceChildren(element("p", { role: "status" }, "This capture is being checked."));
     reveal();
-    await new Promise((resolve) => { setTimeout(resolve, CHECKED_MS); });
-    capture = await read(`/v1/captures/${identifier}`);
-  }
+  };
+  const [capture, jobs, environments] = await Promise.all([checked(identifier, isChecked), jobsOfObject(), readyEnvironments()]);
+  byId("name").textContent = capture.name;
+  document.title = `${capture.name} · Relit`;
   byId("facts").replaceChildren(...factRows(capture.facts ?? {}));
   byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, capture.name, "/captures"));
   if (capture.state !== "ready") {
@@ -147,10 +144,7 @@ await load(async () => {
     takeModes(modesOf(identifier, view, step, now, facts, environments, renders));
     await present(now, facts, work);
   });
-  const renders = (job) => {
-    followJob(work, job);
-    byId("work").scrollIntoView({ block: "center" });
-  };
+  const renders = (job) => { followJob(work, job); byId("work").scrollIntoView({ block: "center" }); };
   const presentAll = (facts) => attempt(async () => {
     await present(jobs, facts, work);
     for (const job of await jobsUnderWay(isOfObject)) followJob(work, job);

@@ -14,22 +14,11 @@ export async function requestRows(job) {
     const isUsual = valueText(value) === usual || (value === false && usual === "");
     given[Number(isUsual)].push([label, value]);
   }
-  const named = await namesOf(given.flat().flatMap(([, value]) => value).filter((value) => /^cap_/.test(value)));
+  const captures = given.flat().flatMap(([, value]) => value).filter((value) => /^cap_/.test(value));
+  const named = new Map(await Promise.all(captures.map(async (id) => [id, await read(`/v1/captures/${id}`).then(({ name }) => name, () => id)]))); // it may be deleted
   const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label),
     element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each, named)]))]));
   return { chosen, usual };
-}
-
-/** Return the names of captures by their identifiers; one that was deleted has none. */
-async function namesOf(captures) {
-  return new Map(await Promise.all(captures.map(async (id) => {
-    try {
-      return [id, (await read(`/v1/captures/${id}`)).name];
-    } catch (error) {
-      if (error.status !== 404) throw error;
-      return [id, undefined];
-    }
-  })));
 }
 
 /** Return how the form of a kind names its fields; jobs that the service makes on its own have no form, and their fields are named by themselves. */
@@ -51,7 +40,7 @@ function valueText(value) {
 }
 
 function link(value, named) {
-  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, named.get(value) ?? value);
+  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, named.get(value));
   if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
   return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
 }

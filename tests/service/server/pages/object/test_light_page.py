@@ -50,6 +50,19 @@ def test_frames_under_a_light_alone_turn_it_as_spin_does(opened, solved):
     opened.locator("output", has_text=re.compile(r"from the camera, \d+° up, \d+° to the left")).wait_for()
 
 
+def test_coefficient_images_that_come_late_are_counted_beside_the_rest_of_the_page(page, solved):
+    held, is_open = [], []
+    page.route("**/results/view.bin", lambda route: route.continue_() if is_open else held.append(route))
+    page.goto(solved.pages["object"])
+    page.get_by_text(re.compile("^0 of [0-9]+ coefficient images are here")).wait_for()
+    expect(page.get_by_role("button", name="Photographs")).to_be_visible()
+    is_open.append(True)
+    for route in held:
+        route.continue_()
+    solved.wait_for_content(page, "light")
+    expect(page.locator(".coming")).to_have_count(0)
+
+
 def test_a_photograph_leads_to_it_beside_the_light(page, solved):
     page.goto(f"{solved.pages['object']}#mode=photographs")
     page.locator("[data-shows=photographs] figure a").nth(CAPTURED).click()
