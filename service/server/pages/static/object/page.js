@@ -119,10 +119,7 @@ async function followJob(work, job) {
 }
 
 await load(async () => {
-  const isChecked = () => {
-    byId("view").replaceChildren(element("p", { role: "status" }, "This capture is being checked."));
-    reveal();
-  };
+  const isChecked = () => { byId("view").replaceChildren(element("p", { role: "status" }, "This capture is being checked.")); reveal(); };
   const [capture, jobs, environments] = await Promise.all([checked(identifier, isChecked), jobsOfObject(), readyEnvironments()]);
   byId("name").textContent = capture.name;
   document.title = `${capture.name} · Relit`;

@@ -14,8 +14,9 @@ export async function requestRows(job) {
     const isUsual = valueText(value) === usual || (value === false && usual === "");
     given[Number(isUsual)].push([label, value]);
   }
-  const captures = given.flat().flatMap(([, value]) => value).filter((value) => /^cap_/.test(value));
-  const named = new Map(await Promise.all(captures.map(async (id) => [id, await read(`/v1/captures/${id}`).then(({ name }) => name, () => id)]))); // it may be deleted
+  const intakes = given.flat().flatMap(([, value]) => value).filter((value) => /^(cap|env)_/.test(value));
+  const pathOf = (id) => `/v1/${id.startsWith("env_") ? "environments" : "captures"}/${id}`;
+  const named = new Map(await Promise.all(intakes.map(async (id) => [id, await read(pathOf(id)).then(({ name }) => name, () => id)]))); // it may be deleted
   const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label),
     element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each, named)]))]));
   return { chosen, usual };
@@ -42,5 +43,5 @@ function valueText(value) {
 function link(value, named) {
   if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, named.get(value));
   if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
-  return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
+  return typeof value === "boolean" ? (value ? "yes" : "no") : named.get(value) ?? valueText(value);
 }

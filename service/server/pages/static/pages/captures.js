@@ -3,6 +3,7 @@
 import { listing, load } from "../api.js";
 import { askHowToImport, mountDropZone } from "../upload/drop_zone.js";
 import { byId, element, time } from "../element.js";
+import { removeLater } from "../object/removal.js";
 import { newest } from "../once.js";
 
 const asked = { captures: newest(), environments: newest() };
@@ -14,9 +15,10 @@ async function list(what) {
   const rows = [];
   for await (const item of listing(`/v1/${what}`, "items")) {
     const name = what === "captures" ? element("a", { href: `/captures/${item.id}` }, item.name) : item.name;
+    const deletion = element("button", { type: "button", class: "bare", "aria-label": `Delete ${item.name}`, onclick: () => removeLater(`/v1/${what}/${item.id}`, item.name, "/captures") }, "Delete"); // environments have no page of their own
     rows.push(element("tr", {}, element("td", {}, name, " ", element("small", {}, item.id)),
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
-      element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
+      element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at), " ", what === "captures" ? null : deletion)));
   }
   return () => isNewest() && body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
 }
