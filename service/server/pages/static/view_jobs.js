@@ -67,7 +67,12 @@ export async function followed(job, place, doing, fault) {
     place.prepend(told);
     reveal();
     try {
-      await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now, bar, stage); } });
+      await watch(`/v1/jobs/${job.id}/events`, { job: (now) => {
+        job = now;
+        if (now.progress === null) bar.removeAttribute("value");
+        else Object.assign(bar, { max: Math.max(now.progress.total, 1), value: now.progress.done });
+        stage.textContent = doingOf(now);
+      } });
       job = await read(`/v1/jobs/${job.id}`);
     } finally {
       told.remove();
@@ -77,10 +82,4 @@ export async function followed(job, place, doing, fault) {
     }
   }
   return job;
-}
-
-function progress(job, bar, stage) {
-  if (job.progress === null) bar.removeAttribute("value");
-  else Object.assign(bar, { max: Math.max(job.progress.total, 1), value: job.progress.done });
-  stage.textContent = doingOf(job);
 }

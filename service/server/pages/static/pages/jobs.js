@@ -15,11 +15,7 @@ const asked = newest();
 let next = null;
 let table = null;
 
-async function learnNames(list) {
-  for (const { id, name } of (await read(`/v1/${list}?limit=500`)).items) names.set(id, name);
-}
-
-const learnt = Promise.all(["captures", "environments"].map(learnNames));
+const learnt = Promise.all(["captures", "environments"].map(async (list) => { for (const { id, name } of (await read(`/v1/${list}?limit=500`)).items) names.set(id, name); }));
 learnt.catch(() => {}); // whoever waits for it is told
 
 /** Show the newest jobs of those that are chosen. */
