@@ -19,8 +19,7 @@ const FOUND = "The lights of this picture are those that the solve has found. Fr
  * @param {string} capture Identifier.
  * @param {import("../view/view_file.js").ViewFile} view Of it.
  * @param {{id: string, name: string}[]} environments Of the server.
- * @param {{canRender?: boolean, submitted?: function(any): void}} [options] Whether the batch can render it: the lights are those of the capture, and not of
- *     a solve alone; and who is given the job that does.
+ * @param {{canRender?: boolean, submitted?: function(any): void}} [options] Whether the batch has these lights, which are not of a solve alone; who gets its job.
  */
 export async function mountLight(parent, capture, view, environments, { canRender = true, submitted = ({ id }) => location.assign(`/jobs/${id}`) } = {}) {
   const batch = {

@@ -2,6 +2,7 @@
 
 import { attempt } from "../api.js";
 import { element, kindTitle } from "../element.js";
+import { ControlAddress } from "../view/control_address.js";
 import { mountAsset } from "./asset.js";
 import { mountFrames } from "./frames.js";
 import { mountLight } from "./light.js";
@@ -49,13 +50,15 @@ function nameOf(job) {
 /** Show what one of some jobs has made, of which a person chooses; at first the newest. */
 async function mountOne(parent, title, jobs, mount) {
   const holder = element("div");
-  const chosen = element("select", {}, ...jobs.map((job) => element("option", {}, nameOf(job))));
+  const chosen = element("select", {}, ...jobs.map((job) => element("option", { value: job.id }, nameOf(job))));
+  const address = new ControlAddress({ of: chosen });
+  address.read();
   const show = () => {
     const place = element("div", {}, element("p", { class: "help", role: "status" }, "Loading …")); // of its own: what comes late of another job is not seen
     holder.replaceChildren(place);
     return mount(place, jobs[chosen.selectedIndex]);
   };
-  chosen.addEventListener("change", () => attempt(show));
+  chosen.addEventListener("change", () => { address.write(); attempt(show); });
   parent.replaceChildren(element("p", { class: "actions", hidden: jobs.length === 1 && title !== "Frames" }, element("label", {}, `${title} of `, chosen)), holder);
   await show();
 }
@@ -78,7 +81,9 @@ async function mountCompared(parent, jobs) {
     if (one.info.rows !== other.info.rows || one.info.cols !== other.info.cols) throw new Error("these maps have different sizes");
     await mountResults(place, one, [{ name: second.selectedOptions[0].textContent, view: other }]);
   });
-  for (const each of [first, second]) each.addEventListener("change", again);
+  const address = new ControlAddress({ of: first, beside: second });
+  address.read();
+  for (const each of [first, second]) each.addEventListener("change", () => { address.write(); again(); });
   parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Maps ", first), element("label", {}, "compared with ", second)), place);
   await again();
 }

@@ -112,10 +112,10 @@ function offerExport(source, jobs, work) {
 
 /** Follow a job; the button that asks for such a job rests meanwhile. */
 async function followJob(work, job) {
-  const buttons = byId("next").querySelectorAll(`[data-kind="${job.request.kind}"]`);
-  for (const button of buttons) button.disabled = true;
+  const rest = (isResting) => byId("next").querySelectorAll(`[data-kind="${job.request.kind}"]`).forEach((button) => { button.disabled = isResting; });
+  rest(true);
   await work.follow(job);
-  for (const button of buttons) button.disabled = false;
+  rest(false);
 }
 
 await load(async () => {

@@ -23,9 +23,8 @@ export async function mountPhotographs(parent, dome, view) {
     figures[index].scrollIntoView({ block: "nearest", inline: "nearest" });
     mark(index);
   };
-  const hasDome = frames.some((frame) => frame.direction !== null);
-  show(dome, hasDome);
-  if (hasDome) mark = mountDome(dome, frames, choose);
+  show(dome, frames.some((frame) => frame.direction !== null));
+  if (!dome.hidden) mark = mountDome(dome, frames, choose);
 }
 
 /** Return a photograph; where it can be compared with live light, as the `at`th, its name leads to it there, whole and under its own light. */

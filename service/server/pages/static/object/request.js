@@ -3,6 +3,8 @@
 import { read, Refusal } from "../api.js";
 import { element, words } from "../element.js";
 
+const LISTS = { cap: "captures", env: "environments" }; // by what identifiers begin with
+
 /** Return rows of a list of facts: what was chosen, and what is as it is by default. */
 export async function requestRows(job) {
   const valueAt = (path) => path.split(".").reduce((value, name) => value?.[name], job.request) ?? "";
@@ -15,8 +17,7 @@ export async function requestRows(job) {
     given[Number(isUsual)].push([label, value]);
   }
   const intakes = given.flat().flatMap(([, value]) => value).filter((value) => /^(cap|env)_/.test(value));
-  const pathOf = (id) => `/v1/${id.startsWith("env_") ? "environments" : "captures"}/${id}`;
-  const named = new Map(await Promise.all(intakes.map(async (id) => [id, await read(pathOf(id)).then(({ name }) => name, () => id)]))); // it may be deleted
+  const named = new Map(await Promise.all(intakes.map(async (id) => [id, await read(`/v1/${LISTS[id.slice(0, 3)]}/${id}`).then(({ name }) => name, () => id)]))); // it may be deleted
   const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label),
     element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each, named)]))]));
   return { chosen, usual };

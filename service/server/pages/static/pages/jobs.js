@@ -12,8 +12,7 @@ const CHOICES = { "": {}, asked: { kind: KINDS }, active: { state: ["queued", "r
 const names = new Map(); // of captures and environments
 const choice = byId("which").elements.namedItem("show");
 const asked = newest();
-let next = null;
-let table = null;
+let [next, table] = [null, null];
 
 const learnt = Promise.all(["captures", "environments"].map(async (list) => { for (const { id, name } of (await read(`/v1/${list}?limit=500`)).items) names.set(id, name); }));
 learnt.catch(() => {}); // whoever waits for it is told

@@ -284,6 +284,10 @@ def test_the_maps_of_any_solve_are_shown(page, made):
     with page.expect_response(f"**/v1/jobs/{made.solve}"):
         chosen.select_option(index=1)
     page.locator("canvas.map").wait_for()
+    page.wait_for_function("(solve) => location.hash.includes(`of=${solve}`)", arg=made.solve)
+    page.reload()  # as a link that was sent
+    page.locator("canvas.map").wait_for()
+    expect(chosen.locator("option:checked")).to_have_text(re.compile(r"^lambert \("))
 
 
 def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):

@@ -115,9 +115,8 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     over?.setLook({ veil: over.layer.name === "confidence" ? "low" : "high" });
     for (const each of [image, other]) each?.setLook(look);
     const alike = other?.layer.name === image.layer.name ? [image, other] : [image]; // what is compared is shown alike
-    const { low, high } = image.look;
     const codes = [...new Set(alike.flatMap(({ layer }) => layer.range))].sort((one, two) => one - two);
-    for (const each of alike) each.setLook({ low, high, codes });
+    for (const each of alike) each.setLook({ low: image.look.low, high: image.look.high, codes });
     const kinds = [image, other].map((each) => each?.layer.kind);
     colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
     stopsRow.hidden = !kinds.includes("colour");
