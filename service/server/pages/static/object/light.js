@@ -43,8 +43,7 @@ export async function mountLight(parent, capture, view, environments, { canRende
     }
     const keys = { schema: "relit.keys/1" };
     if (light.light !== null) {
-      const turns = frames > 1 && spin !== 0 && light.environment === null;
-      keys.lights = [{ name: "key", color_space: "lin_rec709_scene", keys: Array.from({ length: turns ? frames : 1 }, (_, at) => (
+      keys.lights = [{ name: "key", color_space: "lin_rec709_scene", keys: Array.from({ length: spin !== 0 && light.environment === null ? frames : 1 }, (_, at) => (
         { frame: FIRST_FRAME + at, ...light.light, direction: turnedAside(light.light.direction, (spin * at) / frames) })) }];
     }
     if (light.environment !== null) {
