@@ -169,10 +169,10 @@ def label_of(frame: Frame) -> str:
 
 
 def _angles(direction: np.ndarray) -> str:
-    """Return a direction as azimuth and elevation in degrees: 0 and 0 is the camera, azimuth grows to the right."""
+    """Return a direction in words: degrees up or down, and to the right or left of the camera, as pages say of their light."""
     azimuth = np.degrees(np.arctan2(direction[0], direction[2]))
     elevation = np.degrees(np.arcsin(np.clip(direction[1] / np.linalg.norm(direction), -1, 1)))
-    return f"azimuth {azimuth:.0f}°, elevation {elevation:.0f}°"
+    return f"{abs(elevation):.0f}° {'down' if elevation < 0 else 'up'}, {abs(azimuth):.0f}° to the {'left' if azimuth < 0 else 'right'}"
 
 
 def _centre_lights(capture: Capture) -> dict[str, tuple[np.ndarray, np.ndarray]]:

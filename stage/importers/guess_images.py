@@ -147,7 +147,8 @@ def _rig(folder: Folder, fits: Callable[[tuple[int, int]], bool], told: str) -> 
     sizes = [f"{width}x{height}" for width, height in PROJECTORS if fits((width, height))]
     if not sizes:
         return ["--projector", "WIDTHxHEIGHT"], (f"WIDTHxHEIGHT is the projector in pixels; the images show {told}",), False
-    return ["--projector", sizes[0]], (f"the projector has {' or '.join(sizes)} pixels: these have as many bits",), True
+    others = "".join(f", as {size} pixels have too" for size in sizes[1:])
+    return ["--projector", sizes[0]], (f"the projector has {sizes[0]} pixels, which have as many bits{others}",), True
 
 
 def _centred(matrices: Mapping[str, np.ndarray], sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:

@@ -61,8 +61,8 @@ JobName = Annotated[JobId, Path(description="Identifier of the job.")]
 Asked = Annotated[JobRequest, StrictJson(UserJob), Body(openapi_examples=EXAMPLES)]
 States = Annotated[Sequence[states.JobState], Query(description="Of these states alone; none: of all.")]
 
-Kinds = Annotated[Sequence[Annotated[str, Field(max_length=40, pattern=r"^[a-z_]+$")]],
-                  Query(description="Of these kinds alone, such as export; none: of all.", max_length=20)]
+Kinds = Annotated[Sequence[Annotated[str, Field(max_length=40, pattern=r"^[a-z-]+$")]],
+                  Query(description="Of these kinds alone, such as calibrate-dark; none: of all.", max_length=64)]
 
 
 class Priority(BaseModel):

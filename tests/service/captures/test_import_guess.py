@@ -209,6 +209,14 @@ def test_waves_on_a_small_object_are_told(relit, tmp_path):
     assert "looks    like phase shifts" in relit("import", "guess", tmp_path).well()
 
 
+def test_of_projectors_with_as_many_bits_the_one_that_is_taken_is_said(relit, tmp_path):
+    images = blurred_stripes(["columns", "rows", "white", "black"], inverses="pairs", fine_first=False, bits=(10, 10))
+    for number, image in enumerate(images):
+        write_image(tmp_path / f"{number:03d}.png", image)
+    out = relit("import", "guess", tmp_path).well()
+    assert "--projector 1024x768" in out and "the projector has 1024x768 pixels" in out and "as 800x600 pixels have too" in out
+
+
 def test_the_principal_point_tells_the_projector(relit, tmp_path):
     """Both 854 and 640 columns have ten bits; the calibration says no size."""
     images = blurred_stripes(["columns", "rows", "white", "black"], inverses="pairs", fine_first=False, bits=(10, 9))

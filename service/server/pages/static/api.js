@@ -201,8 +201,13 @@ export async function load(action) {
     return await attempt(action, { again: reloadWhenBack, onaway: reloadWhenBack });
   } finally {
     loading -= 1;
-    if (loading === 0) byId("main").removeAttribute("aria-busy");
+    if (loading === 0) reveal();
   }
+}
+
+/** Show what is here of a page, which may move as the rest comes. */
+export function reveal() {
+  byId("main").removeAttribute("aria-busy");
 }
 
 /** Return whether an error says that the capture or job that the page shows does not exist. */

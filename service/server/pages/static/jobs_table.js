@@ -17,6 +17,11 @@ export function progressOf(job) {
   return `${progress.stage} ${progress.done} of ${progress.total}${left}`;
 }
 
+/** Return how far a job is where nothing beside these words tells its state. */
+export function doingOf(job) {
+  return job.state === "queued" ? "waits for a free worker" : progressOf(job) || job.state;
+}
+
 /** Jobs in the body of a table, the newest first. */
 export class JobsTable {
   #rows = new Map();

@@ -7,6 +7,7 @@ import httpx2
 import pytest
 
 from service.requests.base.identifiers import new_id
+from service.requests.jobs import JOBS
 from service.server.database.engine import storable
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 
@@ -105,6 +106,9 @@ def test_jobs_are_listed_a_page_at_a_time_the_newest_first(client, solved):
     for states in (["succeeded"], ["failed", "cancelled"]):
         found = client.get("/v1/jobs", params={"limit": 500, "state": states}).raise_for_status().json()["jobs"]
         assert [job["id"] for job in found] == [job["id"] for job in whole["jobs"] if job["state"] in states]
+    for kinds in (["check"], list(JOBS)):
+        found = client.get("/v1/jobs", params={"limit": 500, "kind": kinds}).raise_for_status().json()["jobs"]
+        assert [job["id"] for job in found] == [job["id"] for job in whole["jobs"] if job["request"]["kind"] in kinds]
     refused(client.get("/v1/jobs", params={"before": NOBODY}), 404, f"{NOBODY} is not in this project")
     refused(client.get("/v1/jobs", params={"limit": 0}), 422, "query.limit")
     refused(client.get("/v1/jobs", params={"state": "lost"}), 422, "query.state.0")

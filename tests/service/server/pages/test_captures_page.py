@@ -145,3 +145,15 @@ def test_a_preview_shows_the_middle_quarter_and_is_no_result_of_the_object(page,
     await_whole(page)
     expect(page.locator("main")).not_to_contain_text("Preview of the middle")
     expect(page.locator("#modes button", has_text="Maps")).to_have_count(1)
+
+
+def test_an_environment_is_deleted(page, server):
+    """It has no page of its own; eight seconds pass before it is gone."""
+    with server.client() as client:
+        made = client.post("/v1/environments", json={"name": "dusk"}).raise_for_status().json()["id"]
+    page.goto("/captures")
+    with page.expect_response(f"**/v1/environments/{made}") as answered:
+        page.locator("#environments tr", has_text=made).get_by_role("button", name="Delete dusk").click()
+    assert answered.value.status == 204
+    await_whole(page)
+    expect(page.locator("#environments tr", has_text=made)).to_have_count(0)

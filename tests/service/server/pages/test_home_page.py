@@ -58,6 +58,20 @@ def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  #
 
 
 @pytest.mark.long
+def test_an_asset_is_found_by_the_name_of_its_capture(page):
+    """Its job has no name, and its card is far below; its request names the maps alone."""
+    pretend(page, [capture(number) for number in range(SHOWN + 20)])
+    export = job(7, "succeeded", request={"kind": "export", "maps": job(3, "succeeded")["id"], "name": "", "format": "usdz"})
+    export |= {"created_at": "2025-01-01T10:00:00Z"}
+    page.route("**/v1/jobs?limit=500&state=succeeded&kind=export&kind=pipeline",
+               lambda route: route.fulfill(json={"jobs": [export], "next": None}))
+    page.route(f"**/v1/jobs/{job(3, 'succeeded')['id']}", lambda route: route.fulfill(json=job(3, "succeeded")))
+    page.goto("/")
+    page.get_by_label("Search by name").fill("bird 3")
+    page.locator(".card", has_text="Asset").locator("h3", has_text="bird 3").wait_for()
+
+
+@pytest.mark.long
 def test_a_thousand_captures_are_searched_sorted_and_filtered(page):
     found = [capture(number) for number in range(CAPTURES)]
     found[7] = capture(7, steps=3) | {"name": EVIL}

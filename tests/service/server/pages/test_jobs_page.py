@@ -55,6 +55,20 @@ def await_offers(page, kinds: set[str]) -> None:
     }""", arg=sorted(kinds))
 
 
+def test_jobs_are_chosen_by_what_asks_for_them_and_how_they_are(page, solved):
+    page.goto("/jobs")
+    page.locator("#jobs tbody a", has_text="Check").first.wait_for()
+    page.get_by_text("Without checks and views").click()
+    page.wait_for_function("() => !/Check|View/.test(document.querySelector('#jobs tbody').textContent)")
+    expect(page.locator("#jobs tbody a", has_text=TITLES["solve"]).first).to_be_visible()
+    page.get_by_text("Failed", exact=True).click()
+    page.wait_for_function("() => location.hash === '#failed'")
+    page.reload()
+    await_whole(page)
+    expect(page.get_by_role("radio", name="Failed")).to_be_checked()
+    expect(page.locator("#jobs .state:not(.failed)")).to_have_count(0)
+
+
 def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot_apply(server, page, capture, patterns):
     page.goto(f"/captures/{patterns}")
     page.get_by_role("heading", name="<b>stripes", level=1).wait_for()
@@ -70,7 +84,7 @@ def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot
         jobs = client.get("/v1/jobs", params={"kind": "pipeline", "limit": 500}).json()["jobs"]
         job, = [each["id"] for each in jobs if each["request"]["capture"] == capture]
         page.goto(f"/jobs/{job}")  # on the page of the object its line goes when it has succeeded
-        expect(page.locator("#request dd", has_text=capture)).to_be_visible()
+        expect(page.locator(f"#request dd a[href='/captures/{capture}']")).to_be_visible()
         page.locator("#usual-part > summary").click()
         expect(page.locator("#usual dt").first).to_be_visible()
         request = page.locator("#request, #usual").all_inner_texts()

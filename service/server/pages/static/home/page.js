@@ -2,10 +2,10 @@
 
 import { attempt, load, newToken, postOnce, read, Refusal, send } from "../api.js";
 import { isUnderWay, mountDropZone } from "../upload/drop_zone.js";
-import { byId, setChildren, show } from "../element.js";
+import { byId, setChildren, show, words } from "../element.js";
 import { captureOf } from "../view_jobs.js";
 import { titleOf } from "../jobs_table.js";
-import { newest } from "../once.js";
+import { newest, once } from "../once.js";
 import { cardOf, setPicture } from "./card.js";
 import { assetItem, chosen, intakeItem, itemsOf } from "./items.js";
 import { Jobs } from "./jobs.js";
@@ -92,12 +92,23 @@ async function showPicture(card) {
   }
 }
 
+/** Return the capture that an item comes from; an asset without a name of its own gets that of its capture. */
+async function captureItem(item) {
+  if (item.kind !== "asset") return item;
+  const capture = items.get(await captureOf(item.source));
+  item.name ||= capture?.name ?? words(item.kind);
+  cards.get(item.id)?.querySelector("h3").firstChild.replaceChildren(item.name);
+  return capture;
+}
+
+/** Give all assets their names, which are searched. */
+async function nameAssets() {
+  for (const item of items.values()) if (item.name === "") await captureItem(item);
+  draw();
+}
+
 async function viewPicture(item) {
-  const capture = item.kind === "asset" ? items.get(await captureOf(item.source)) : item;
-  if (capture !== undefined && item.name === "") { // an asset without a name of its own has that of its capture
-    item.name = capture.name;
-    cards.get(item.id).querySelector("h3").firstChild.textContent = item.name;
-  }
+  const capture = await captureItem(item);
   return capture?.source.view ? pictureOf(capture.source.view) : null;
 }
 
@@ -177,6 +188,7 @@ for (const [name, control] of [["kind", wanted.kind], ["order", wanted.order]]) 
   if (address.has(name)) control.value = address.get(name);
 }
 byId("bar").addEventListener("input", () => { most = PAGE; draw(); });
+byId("search").addEventListener("input", () => attempt(() => once(items, nameAssets)));
 byId("bar").addEventListener("submit", (event) => event.preventDefault());
 byId("more").addEventListener("click", () => { most += PAGE; draw(); });
 new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !byId("more").hidden) byId("more").click(); }, { rootMargin: "600px" }).observe(byId("more"));
@@ -198,6 +210,7 @@ await load(async () => {
   lists.flat().forEach(put); // captures first, whose pictures and names assets have
   isLoaded = true;
   draw();
+  if (wanted.words.value !== "") attempt(() => once(items, nameAssets));
   changed(null);
 });
 await attempt(() => jobs.follow());

@@ -1,7 +1,7 @@
 /** The jobs that run, wait or have failed lately, in a strip, with the reason why each waits. */
 
 import { element, setChildren, show } from "../element.js";
-import { progressOf } from "../jobs_table.js";
+import { doingOf } from "../jobs_table.js";
 
 const FAILED_HOURS = 24;
 const MOST_FAILED = 3;
@@ -19,7 +19,7 @@ function reasonOf(job, active, title, fault) {
   const isBefore = (other) => other.state === "running" || other.priority > job.priority
     || (other.priority === job.priority && other.created_at < job.created_at);
   const before = active.filter((other) => other.id !== job.id && other.request.kind !== "check" && isBefore(other));
-  if (before.length === 0) return fault === "" ? "waits for a free worker" : `waits: ${fault}`;
+  if (before.length === 0) return fault === "" ? doingOf(job) : `waits: ${fault}`;
   const [first] = before.sort((one, other) => ACTIVE.indexOf(one.state) - ACTIVE.indexOf(other.state));
   const doing = first.state === "running" ? "which runs" : "which waits too";
   return before.length === 1 ? `behind ${title(first)}, ${doing}` : `behind ${before.length} jobs, first ${title(first)}, ${doing}`;
@@ -39,7 +39,7 @@ export function showStrip(strip, jobs, title, fault) {
     const isMeasured = job.state === "running" && job.progress?.total > 0;
     setChildren(line, [line.firstChild,
       ...(isMeasured ? [element("progress", { value: job.progress.done, max: job.progress.total, "aria-label": `Progress of ${title(job)}` })] : []),
-      element("p", {}, job.state === "queued" ? reasonOf(job, active, title, fault) : progressOf(job) || job.state)]);
+      element("p", {}, job.state === "queued" ? reasonOf(job, active, title, fault) : doingOf(job))]);
     return line;
   }));
   show(strip, shown.length > 0);

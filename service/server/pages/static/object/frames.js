@@ -2,7 +2,7 @@
 
 import { attempt, fetched, listing, read, Refusal, warningsIn } from "../api.js";
 import { bytes, element, icon } from "../element.js";
-import { newest, once } from "../once.js";
+import { once } from "../once.js";
 import { savingLink } from "./files.js";
 import { offerVideo } from "./video.js";
 
@@ -12,25 +12,11 @@ const PARALLEL = 3;
 const UNREADABLE = "The browser cannot read it.";
 const STRIP_PX = 72; // height of the pictures of the filmstrip
 
-/**
- * Show the frames of jobs, of which a person chooses one; at first the newest.
- * @param {HTMLElement} parent Takes them. @param {any[]} jobs That have relit frames. @param {function(any): string} nameOf A job.
- */
-export async function mountFrames(parent, jobs, nameOf) {
-  const chosen = element("select", {}, ...jobs.map((job) => element("option", { value: job.id }, nameOf(job))));
-  const [place, asked] = [element("div"), newest()];
-  const again = () => attempt(() => player(place, chosen.value, asked()));
-  chosen.addEventListener("change", again);
-  parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Frames of ", chosen)), place);
-  await again();
-}
-
-/** Show the frames of a job, and load their pictures for as long as these frames are shown; `isChosen` says whether they still are to be. */
-async function player(place, job, isChosen) {
+/** Show the frames of a job, by its identifier, and load their pictures for as long as the place is on the page. */
+export async function mountFrames(place, job) {
   const frames = [];
   for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
   const warnings = warningsIn((await read(`/v1/jobs/${job}/log`)).entries);
-  if (!isChosen()) return;
   if (frames.length === 0) throw new Error("this job has no frames any more");
   const canvas = element("canvas", { class: "frames-picture", role: "img", "aria-label": "A relit frame" });
   const slider = element("input", { type: "range", min: 0, max: frames.length - 1, step: 1, value: 0, "aria-label": "Frame" });

@@ -5,7 +5,7 @@ import { element } from "../element.js";
 import { loadEnvironment } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
 import { once } from "../once.js";
-import { mount } from "../view/light/relight_viewer.js";
+import { mount, turnedAside } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
 import { warningsOf } from "./results.js";
 import { mountVideo } from "./video.js";
@@ -19,9 +19,9 @@ const FOUND = "The lights of this picture are those that the solve has found. Fr
  * @param {string} capture Identifier.
  * @param {import("../view/view_file.js").ViewFile} view Of it.
  * @param {{id: string, name: string}[]} environments Of the server.
- * @param {{canRender?: boolean}} [options] Whether the batch can render it: the lights are those of the capture, and not of a solve alone.
+ * @param {{canRender?: boolean, submitted?: function(any): void}} [options] Whether the batch has these lights, which are not of a solve alone; who gets its job.
  */
-export async function mountLight(parent, capture, view, environments, { canRender = true } = {}) {
+export async function mountLight(parent, capture, view, environments, { canRender = true, submitted = ({ id }) => location.assign(`/jobs/${id}`) } = {}) {
   const batch = {
     last: element("input", { type: "text", inputmode: "numeric", value: "24", size: 5, autocomplete: "off" }),
     spin: element("input", { type: "text", inputmode: "decimal", value: "360", size: 6, autocomplete: "off" }),
@@ -30,7 +30,7 @@ export async function mountLight(parent, capture, view, environments, { canRende
   };
   let light = null;
 
-  /** Return the job that makes what is shown: the first frame as it is now, then the environment turning on. */
+  /** Return the job that makes what is shown: the first frame as it is now, then the environment turning on, or the light where there is none. */
   function request() {
     const frames = Number(batch.last.value);
     const spin = Number(batch.spin.value);
@@ -42,7 +42,10 @@ export async function mountLight(parent, capture, view, environments, { canRende
       throw new Error(`${light.environment.name} is a file of this machine: upload it on the page of captures, and choose it above`);
     }
     const keys = { schema: "relit.keys/1" };
-    if (light.light !== null) keys.lights = [{ name: "key", color_space: "lin_rec709_scene", keys: [{ frame: FIRST_FRAME, ...light.light }] }];
+    if (light.light !== null) {
+      keys.lights = [{ name: "key", color_space: "lin_rec709_scene", keys: Array.from({ length: spin !== 0 && light.environment === null ? frames : 1 }, (_, at) => (
+        { frame: FIRST_FRAME + at, ...light.light, direction: turnedAside(light.light.direction, (spin * at) / frames) })) }];
+    }
     if (light.environment !== null) {
       const { turn_degrees: turn, exposure } = light.environment;
       keys.environment = [{ frame: FIRST_FRAME, turn_degrees: turn, exposure }];
@@ -72,15 +75,14 @@ export async function mountLight(parent, capture, view, environments, { canRende
   async function submit() {
     present();
     if (!batch.fault.hidden) return;
-    const job = await submitJob(request());
-    location.assign(`/jobs/${job.id}`);
+    submitted(await submitJob(request()));
   }
 
   function batchForm() {
     for (const each of [batch.last, batch.spin]) each.addEventListener("input", present);
     return element("section", { "aria-label": "Frames" }, element("h2", {}, "Render these frames"),
       element("form", { novalidate: true, onsubmit: (event) => { event.preventDefault(); attempt(() => once(event.target, submit)); } },
-        element("p", { class: "actions" }, element("label", {}, "Frames ", batch.last), element("label", {}, "Spin of the environment (degrees) ", batch.spin),
+        element("p", { class: "actions" }, element("label", {}, "Frames ", batch.last), element("label", {}, "Spin (degrees) ", batch.spin),
           element("button", { type: "submit" }, "Render")), batch.fault,
         element("details", { class: "same-as" }, element("summary", {}, "The same as a command"), batch.command, element("p", {}, "with this keys.json:"), batch.keys,
           element("p", {}, "With curl:"), batch.curl)));

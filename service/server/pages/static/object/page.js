@@ -1,13 +1,13 @@
 /** The page of one object: what was captured and what was made of it, as modes of one view. Its address says which is shown, and how. */
 
-import { attempt, listing, load, read } from "../api.js";
+import { attempt, listing, load, reveal, submitJob } from "../api.js";
 import { byId, element, factRows, show } from "../element.js";
 import { readyEnvironments } from "../environments.js";
 import { Address, writeNow } from "../publish/address.js";
-import { newest } from "../once.js";
+import { newest, once } from "../once.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
-import { openView } from "../view_jobs.js";
+import { checked, openView } from "../view_jobs.js";
 import { newestFiles, presentFiles, presentReport, savingLink } from "./files.js";
 import { offerFusion } from "./fusion.js";
 import { modesOf } from "./modes.js";
@@ -17,7 +17,8 @@ import { PREVIEW } from "./results.js";
 import { jobsUnderWay, Work } from "./work.js";
 
 const identifier = byId("main").dataset.identifier;
-const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
+const MADE_BY = { pipeline: ["solve"], solve: ["pipeline"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
+const EXPORTED = ["maps.exr", "points.ply"]; // files of the jobs that an asset can be made of
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
 const known = new Set(); // jobs of this object that have succeeded
@@ -90,9 +91,10 @@ function takeModes(found) {
 /** Show what was made, and what can be made next; the newest asset is one click away. */
 async function present(jobs, facts, work) {
   const done = jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]);
-  offerSteps(byId("next"), facts, identifier, done, (job) => work.follow(job));
-  await offerFusion(byId("fusion"), identifier, jobs, (job) => work.follow(job));
+  offerSteps(byId("next"), facts, identifier, done, (job) => followJob(work, job));
+  await offerFusion(byId("fusion"), identifier, jobs, (job) => followJob(work, job));
   const files = await newestFiles(jobs);
+  offerExport(files.find(({ name }) => EXPORTED.includes(name))?.job, jobs, work);
   presentFiles(byId("files"), files);
   show(byId("files-part"), files.length > 0);
   presentReport(byId("report-part"), files);
@@ -101,8 +103,24 @@ async function present(jobs, facts, work) {
   setPrimary(byId("next"));
 }
 
+/** Offer an asset of the newest maps or points where there is none, without solving them again. */
+function offerExport(source, jobs, work) {
+  const button = byId("export");
+  show(button, source !== undefined && source.request.kind !== "pipeline" && !jobs.some(({ request: { kind, maps } }) => kind === "export" && maps === source.id));
+  button.onclick = () => attempt(() => once(button, async () => followJob(work, await submitJob({ kind: "export", maps: source.id }))));
+}
+
+/** Follow a job; the button that asks for such a job rests meanwhile. */
+async function followJob(work, job) {
+  const rest = (isResting) => byId("next").querySelectorAll(`[data-kind="${job.request.kind}"]`).forEach((button) => { button.disabled = isResting; });
+  rest(true);
+  await work.follow(job);
+  rest(false);
+}
+
 await load(async () => {
-  const [capture, jobs, environments] = await Promise.all([read(`/v1/captures/${identifier}`), jobsOfObject(), readyEnvironments()]);
+  const isChecked = () => { byId("view").replaceChildren(element("p", { role: "status" }, "This capture is being checked.")); reveal(); };
+  const [capture, jobs, environments] = await Promise.all([checked(identifier, isChecked), jobsOfObject(), readyEnvironments()]);
   byId("name").textContent = capture.name;
   document.title = `${capture.name} · Relit`;
   byId("facts").replaceChildren(...factRows(capture.facts ?? {}));
@@ -111,22 +129,31 @@ await load(async () => {
     byId("view").replaceChildren(element("p", {}, `${capture.problem ?? `This capture is ${capture.state}.`} `, element("a", { href: `/captures/${identifier}` }, "Its page says more.")));
     return;
   }
+  byId("view").querySelector("p")?.remove();
   const step = await chosenStep(capture.facts);
-  const view = await ViewFile.open((await openView(identifier, null, step, byId("view"))).files);
-  const facts = litFacts(capture.facts ?? {}, view);
+  const viewing = openView(identifier, null, step, byId("view")).then(({ files }) => ViewFile.open(files));
   const asked = newest();
   const work = new Work(byId("work"), async () => {
     const isNewest = asked();
-    const now = await jobsOfObject();
+    const [view, now] = await Promise.all([viewing, jobsOfObject()]);
     if (!isNewest()) return; // another job has ended meanwhile, and its look sees both
-    takeModes(modesOf(identifier, view, step, now, facts, environments));
+    const facts = litFacts(capture.facts ?? {}, view);
+    takeModes(modesOf(identifier, view, step, now, facts, environments, renders));
     await present(now, facts, work);
   });
-  takeModes(modesOf(identifier, view, step, jobs, facts, environments));
+  const renders = (job) => { followJob(work, job); byId("work").scrollIntoView({ block: "center" }); };
+  const presentAll = (facts) => attempt(async () => {
+    await present(jobs, facts, work);
+    for (const job of await jobsUnderWay(isOfObject)) followJob(work, job);
+  });
+  const early = capture.view === null ? presentAll(capture.facts ?? {}) : null; // its view is prepared first, which may wait for other jobs
+  const view = await viewing;
+  const facts = litFacts(capture.facts ?? {}, view);
+  takeModes(modesOf(identifier, view, step, jobs, facts, environments, renders));
   const wanted = { mode: "" };
   address.read(wanted);
   const first = wanted.mode in modes ? wanted.mode : Object.keys(modes)[0];
-  const presented = attempt(() => present(jobs, facts, work));
+  const presented = early ?? presentAll(facts);
   if (first === undefined) byId("view").replaceChildren(element("p", {}, "There is nothing to show of this capture yet."));
   else {
     address.write({ mode: first });
@@ -134,5 +161,4 @@ await load(async () => {
     await choose(first);
   }
   await presented;
-  for (const job of await jobsUnderWay(isOfObject)) work.follow(job);
 });

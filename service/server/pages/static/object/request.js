@@ -3,6 +3,8 @@
 import { read, Refusal } from "../api.js";
 import { element, words } from "../element.js";
 
+const LISTS = { cap: "captures", env: "environments" }; // by what identifiers begin with
+
 /** Return rows of a list of facts: what was chosen, and what is as it is by default. */
 export async function requestRows(job) {
   const valueAt = (path) => path.split(".").reduce((value, name) => value?.[name], job.request) ?? "";
@@ -14,8 +16,10 @@ export async function requestRows(job) {
     const isUsual = valueText(value) === usual || (value === false && usual === "");
     given[Number(isUsual)].push([label, value]);
   }
+  const intakes = given.flat().flatMap(([, value]) => value).filter((value) => /^(cap|env)_/.test(value));
+  const named = new Map(await Promise.all(intakes.map(async (id) => [id, await read(`/v1/${LISTS[id.slice(0, 3)]}/${id}`).then(({ name }) => name, () => id)]))); // it may be deleted
   const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label),
-    element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each)]))]));
+    element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each, named)]))]));
   return { chosen, usual };
 }
 
@@ -37,8 +41,8 @@ function valueText(value) {
   return value.name ?? value.schema ?? `${Object.keys(value).length} values`;
 }
 
-function link(value) {
-  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, value);
+function link(value, named) {
+  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, named.get(value));
   if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
-  return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
+  return typeof value === "boolean" ? (value ? "yes" : "no") : named.get(value) ?? valueText(value);
 }

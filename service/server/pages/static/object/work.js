@@ -4,7 +4,7 @@ import { attempt, listing, post, read } from "../api.js";
 import { element, kindTitle } from "../element.js";
 import { once } from "../once.js";
 import { watch } from "../events.js";
-import { progressOf } from "../jobs_table.js";
+import { doingOf } from "../jobs_table.js";
 
 const LEFT_OUT = ["view", "check"]; // what pages do on their own
 const ENDED = ["succeeded", "failed", "cancelled"];
@@ -25,19 +25,20 @@ export class Work {
     this.#done = done;
   }
 
-  /** Show a job until it has succeeded; one that fails stays, with its reason. */
+  /** Show a job until it has succeeded, and return when it has ended; one that fails stays, with its reason. */
   follow(job) {
     const [bar, words] = [element("progress", { "aria-label": `Progress of ${kindTitle(job.request.kind)}` }), element("span", { role: "status" })];
     const button = element("button", { type: "button", class: "quiet", onclick: () => attempt(() => once(line, () => this.#act(job.id))) });
     const line = element("li", { "data-job": job.id }, element("strong", {}, kindTitle(job.request.kind)), bar, button, element("a", { href: `/jobs/${job.id}` }, "Details"), words);
-    this.#lines.set(job.id, { line, bar, words, button, state: "" });
+    const ended = new Promise((end) => { this.#lines.set(job.id, { line, bar, words, button, end, state: "" }); });
     this.#box.append(line);
     this.#present(job);
     this.#watch();
+    return ended;
   }
 
   async #act(id) {
-    const action = this.#lines.get(id).state === "failed" ? "retry" : "cancel";
+    const action = { failed: "retry", cancelled: "resume" }[this.#lines.get(id).state] ?? "cancel";
     this.#present(await post(`/v1/jobs/${id}/${action}`));
     this.#watch();
   }
@@ -52,16 +53,17 @@ export class Work {
   #present(job) {
     const shown = this.#lines.get(job.id);
     if (shown === undefined || shown.state === "succeeded" || job.revision < shown.revision) return; // an answer that was overtaken
-    const { line, bar, words, button } = shown;
+    const { line, bar, words, button, end } = shown;
     shown.revision = job.revision;
     shown.state = line.className = job.state;
-    words.textContent = job.state === "queued" ? "waits for a free worker" : progressOf(job) || job.state;
+    words.textContent = doingOf(job);
     if (job.state === "running" && job.progress?.total > 0) Object.assign(bar, { max: job.progress.total, value: job.progress.done });
     else bar.removeAttribute("value");
     bar.hidden = ENDED.includes(job.state);
-    button.hidden = job.state === "succeeded" || job.state === "cancelled";
-    button.textContent = job.state === "failed" ? "Try again" : "Stop";
-    if (job.state === "succeeded") attempt(() => this.#done(job)).finally(() => { line.remove(); this.#lines.delete(job.id); });
+    button.hidden = job.state === "succeeded";
+    button.textContent = { failed: "Try again", cancelled: "Resume" }[job.state] ?? "Stop";
+    if (job.state === "succeeded") attempt(() => this.#done(job)).finally(() => { line.remove(); this.#lines.delete(job.id); end(); });
+    else if (ENDED.includes(job.state)) end();
     if ([...this.#lines.values()].some(({ state }) => !ENDED.includes(state))) return;
     this.#stop?.abort();
     this.#stop = null;

@@ -1,6 +1,6 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read } from "../api.js";
+import { attempt, listing, load } from "../api.js";
 import { byId, element, factRows, show } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
@@ -14,19 +14,14 @@ import { offerPreview } from "./preview.js";
 import { chosenStep } from "../time_steps.js";
 import { settled } from "../upload/upload.js";
 import { ViewFile } from "../view/view_file.js";
-import { openView } from "../view_jobs.js";
+import { checked, openView } from "../view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
 
 async function open() {
-  let capture = await read(`/v1/captures/${identifier}`);
+  const capture = await checked(identifier, present);
   present(capture);
-  while (capture.state === "checking") {
-    await new Promise((resolve) => { setTimeout(resolve, 500); });
-    capture = await read(`/v1/captures/${identifier}`);
-    present(capture);
-  }
   if (capture.state === "receiving" && capture.facts?.proposal !== undefined) await ask(capture);
   if (capture.state !== "ready") return;
   offer(capture.facts ?? {});

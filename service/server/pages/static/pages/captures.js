@@ -3,6 +3,8 @@
 import { listing, load } from "../api.js";
 import { askHowToImport, mountDropZone } from "../upload/drop_zone.js";
 import { byId, element, time } from "../element.js";
+import { intakeItem } from "../home/items.js";
+import { removeLater } from "../object/removal.js";
 import { newest } from "../once.js";
 
 const asked = { captures: newest(), environments: newest() };
@@ -14,9 +16,10 @@ async function list(what) {
   const rows = [];
   for await (const item of listing(`/v1/${what}`, "items")) {
     const name = what === "captures" ? element("a", { href: `/captures/${item.id}` }, item.name) : item.name;
+    const deletion = element("button", { type: "button", class: "bare", "aria-label": `Delete ${item.name}`, onclick: () => removeLater(`/v1/${what}/${item.id}`, item.name, "/captures") }, "Delete"); // environments have no page of their own
     rows.push(element("tr", {}, element("td", {}, name, " ", element("small", {}, item.id)),
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
-      element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
+      element("td", {}, item.problem ?? intakeItem(what, item).size, " ", question(item)), element("td", {}, time(item.created_at), " ", what === "captures" ? null : deletion)));
   }
   return () => isNewest() && body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
 }
@@ -25,15 +28,6 @@ async function list(what) {
 function question(item) {
   if (item.facts?.proposal === undefined || item.state === "checking") return null;
   return element("button", { type: "button", class: "quiet", onclick: () => askHowToImport(item) }, "Choose and import");
-}
-
-function content(facts) {
-  if (facts === null) return "";
-  if (facts.proposal !== undefined) return facts.proposal.summary;
-  const parts = [];
-  if (facts.frames !== undefined) parts.push(`${facts.frames} frames`);
-  if (facts.resolution !== undefined) parts.push(facts.resolution.join(" × "));
-  return parts.join(", ");
 }
 
 mountDropZone(async (what) => (await list(what))());

@@ -1,10 +1,10 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
 import { attempt, listing, load, post, read, resultsOf, save, warningsIn } from "../api.js";
-import { byId, bytes, duration, element, show, time } from "../element.js";
+import { byId, bytes, element, show, time } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
-import { titleOf } from "../jobs_table.js";
+import { progressOf, titleOf } from "../jobs_table.js";
 import { setPrimary } from "../object/next_steps.js";
 import { removeLater } from "../object/removal.js";
 import { newest, once } from "../once.js";
@@ -15,6 +15,7 @@ const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
 const SEQUENCE = "sequence.json";
+const SHOWN_AS = { relight: "frames", solve: "maps", depth: "depth" }; // modes of the page of an object
 const asked = newest();
 const warnings = new Set();
 let logged = "";
@@ -28,15 +29,9 @@ function present(job) {
   byId("state").replaceChildren(element("span", { class: `state ${job.state}` }, job.state), job.attempt > 1 ? ` attempt ${job.attempt}` : "");
   show(byId("progress"), job.state === "running");
   const bar = byId("bar");
-  if (job.progress !== null && job.progress.total > 0) {
-    bar.max = job.progress.total;
-    bar.value = job.progress.done;
-    const left = job.progress.remaining_s === null ? "" : `, ${duration(job.progress.remaining_s)} left`;
-    byId("stage").textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}${left}`;
-  } else {
-    bar.removeAttribute("value");
-    byId("stage").textContent = "";
-  }
+  if (job.progress?.total > 0) Object.assign(bar, { max: job.progress.total, value: job.progress.done });
+  else bar.removeAttribute("value");
+  byId("stage").textContent = progressOf(job);
   show(byId("error"), job.error !== null);
   byId("error").textContent = job.error ?? "";
   const ended = ENDED.includes(job.state);
@@ -79,10 +74,10 @@ async function presentResults(job) {
     rows.push(element("tr", {}, element("td", {}, element("a", { href: result.url, onclick: (event) => download(event, result) }, result.name)),
       element("td", {}, bytes(result.size))));
   }
-  byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
+  byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, ENDED.includes(job.state) ? "No files." : "No files yet."))]));
   const solved = job.state === "succeeded" && [...MAPS, SEQUENCE].some((name) => names.includes(name));
   offer("look", solved, `/maps/${identifier}`);
-  offer("object", job.state === "succeeded" && job.request.capture !== undefined, `/object/${job.request.capture}`);
+  offer("object", job.state === "succeeded" && job.request.capture !== undefined, `/object/${job.request.capture}#mode=${SHOWN_AS[job.request.kind] ?? ""}`);
   offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);

@@ -38,9 +38,9 @@ export function colourTable(name) {
   return tables.get(name);
 }
 
-/** Return the colour of a code as bytes; null: the code 0, which stands for nothing. */
-export function codeColour(layer, code) {
-  return code === 0 ? null : CODE_COLOURS[layer.range.filter((each) => each !== 0).indexOf(code) % CODE_COLOURS.length] ?? CODE_COLOURS.at(-1);
+/** Return the colour of a code beside others as bytes; null: the code 0, which stands for nothing. */
+export function codeColour(codes, code) {
+  return code === 0 ? null : CODE_COLOURS[codes.filter((each) => each !== 0).indexOf(code) % CODE_COLOURS.length] ?? CODE_COLOURS.at(-1);
 }
 
 /** Return the byte of a linear value, encoded as sRGB does (IEC 61966-2-1). */
@@ -57,8 +57,8 @@ const ENCODED = Uint8ClampedArray.from({ length: 4096 }, (_, index) => {
  * Paint a tile.
  * @param {any} layer Of view.json.
  * @param {import("./view_file.js").Tile} tile
- * @param {{low: number, high: number, stops: number, colours: string, space: string, veil?: "low"|"high"}} look `veil`: numbers become a grey that
- *     covers the more, the lower or the higher they are.
+ * @param {{low: number, high: number, codes: number[], stops: number, colours: string, space: string, veil?: "low"|"high"}} look `veil`: numbers become a
+ *     grey that covers the more, the lower or the higher they are.
  * @returns {ImageData}
  */
 export function paint(layer, tile, look) {
@@ -85,7 +85,7 @@ export function paint(layer, tile, look) {
     }
   } else if (layer.kind === "codes") {
     for (let at = 0, to = 0; at < count; at += 1, to += 4) {
-      const colour = codeColour(layer, Math.round(x[at]));
+      const colour = codeColour(look.codes, Math.round(x[at]));
       if (colour !== null) data.set([...colour, 255], to);
     }
   } else if (look.veil !== undefined) {

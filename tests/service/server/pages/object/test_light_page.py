@@ -1,5 +1,6 @@
 """Live relighting shows what `relit relight` makes, and sends exactly that to the batch."""
 
+import json
 import re
 import shutil
 
@@ -37,6 +38,39 @@ def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     opened.get_by_label("Size of the light in degrees").fill("10")
     shown = picture(opened)
     assert_same(shown, *rendered(opened, solved, tmp_path))
+
+
+def test_frames_under_a_light_alone_turn_it_as_spin_does(opened, solved):
+    """What is shown after a quarter of the turn is the second of four frames."""
+    opened.get_by_label("Frames", exact=True).last.fill("4")
+    lights = json.loads(opened.locator("[data-shows=keys]").text_content())["lights"]
+    assert [key["frame"] for key in lights[0]["keys"]] == [1, 2, 3, 4]
+    opened.evaluate("relit.turn(90)")
+    assert np.allclose(opened.evaluate("relit.state().light.direction"), lights[0]["keys"][1]["direction"], atol=1e-9)
+    opened.locator("output", has_text=re.compile(r"from the camera, \d+° up, \d+° to the left")).wait_for()
+
+
+def test_coefficient_images_that_come_late_are_counted_beside_the_rest_of_the_page(page, solved):
+    held, is_open = [], []
+    page.route("**/results/view.bin", lambda route: route.continue_() if is_open else held.append(route))
+    page.goto(solved.pages["object"])
+    page.get_by_text(re.compile("^0 of [0-9]+ coefficient images are here")).wait_for()
+    expect(page.get_by_role("button", name="Photographs")).to_be_visible()
+    is_open.append(True)
+    for route in held:
+        route.continue_()
+    solved.wait_for_content(page, "light")
+    expect(page.locator(".coming")).to_have_count(0)
+
+
+def test_a_photograph_leads_to_it_beside_the_light(page, solved):
+    page.goto(f"{solved.pages['object']}#mode=photographs")
+    page.locator("[data-shows=photographs] figure a").nth(CAPTURED).click()
+    solved.wait_for_content(page, "light")
+    expect(page.get_by_label("Photograph to compare with")).to_have_value(str(CAPTURED))
+    with solved.server.client() as client:
+        frame = prepared_view(client, solved.capture)["frames"][CAPTURED]
+    assert np.allclose(page.evaluate("relit.state().light.direction"), frame["direction"], atol=2e-3)  # of three decimals
 
 
 def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(opened):

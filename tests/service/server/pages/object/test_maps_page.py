@@ -187,7 +187,7 @@ def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
 
 
 def test_every_map_of_the_capture_is_shown(opened):
-    """Each layer has tiles, a histogram or a legend, and a value under the cursor."""
+    """Each layer has tiles, a histogram or a legend unless it is the mask, and a value under the cursor."""
     layers = opened.get_by_label("Layer", exact=True).first
     names = layers.locator("option").evaluate_all("all => all.map(each => each.value)")
     assert {"normal", "diffuse_albedo", "height", "confidence", "status", "mask"} <= set(names)
@@ -195,7 +195,8 @@ def test_every_map_of_the_capture_is_shown(opened):
     for name in names:
         layers.select_option(name)
         pictures.append(drawn(opened, *pictures))  # each is another
-        expect(opened.locator(".histogram canvas, .histogram li").first).to_be_visible()
+        if name != "mask":  # of two values
+            expect(opened.locator(".histogram canvas, .histogram li").first).to_be_visible()
         assert "row 64, column 64" in point_at(opened, 64, 64, 128)
         opened.mouse.move(5, 5)
 

@@ -192,6 +192,38 @@ def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made)
     page.reload()
     page.locator("[data-shows=compare] canvas.map").wait_for()
     expect(how).to_have_value("beside")
+    page.get_by_label("Layer", exact=True).select_option("sigma")
+    expect(page.get_by_label("Compare with", exact=True)).to_have_value("0/sigma")
+    page.get_by_label("Highest value that is shown").fill("1")
+
+    def brightest() -> bool:
+        """Return whether both show what lies above the highest value in the last colour of viridis, but for edges and hatching."""
+        shares = page.locator("canvas.map").evaluate("""(canvas) => {
+          const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height), counts = [[0, 0], [0, 0]];
+          for (let at = 0; at < data.length; at += 4) {
+            if (data[at + 3] < 255 || Math.abs(data[at] - data[at + 1]) + Math.abs(data[at] - data[at + 2]) < 60) continue;
+            const half = counts[(at / 4) % canvas.width < canvas.width / 2 ? 0 : 1];
+            half[Number(data[at] > 240 && data[at + 1] > 220)] += 1;
+          }
+          return counts.map(([others, yellow]) => yellow / (others + yellow));
+        }""")
+        return min(shares) > 0.9
+
+    seen(page, brightest, "the two are shown by different ranges")
+
+
+def test_the_maps_of_any_solve_are_shown(page, made):
+    page.goto(f"{made.pages['object']}#mode=maps")
+    chosen = page.get_by_label("Maps of")
+    expect(chosen.locator("option")).to_have_text([re.compile(r"^<i>other \("), re.compile(r"^lambert \(")])
+    page.locator("canvas.map").wait_for()
+    with page.expect_response(f"**/v1/jobs/{made.solve}"):
+        chosen.select_option(index=1)
+    page.locator("canvas.map").wait_for()
+    page.wait_for_function("(solve) => location.hash.includes(`of=${solve}`)", arg=made.solve)
+    page.reload()  # as a link that was sent
+    page.locator("canvas.map").wait_for()
+    expect(chosen.locator("option:checked")).to_have_text(re.compile(r"^lambert \("))
 
 
 def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):

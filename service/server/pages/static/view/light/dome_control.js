@@ -81,7 +81,8 @@ export function mountDomeControl(parent, model, captured, moved) {
     else {
       const [x, y, z] = direction;
       const degrees = (radians) => Math.round((180 * radians) / Math.PI);
-      words.textContent = `${degrees(Math.acos(Math.max(-1, Math.min(1, z))))}° from the camera, ${degrees(Math.asin(y))}° up, ${degrees(Math.atan2(x, z))}° to the right${model.isBeyond(direction) ? ": beyond the captured lights" : ""}`;
+      const side = (angle, more, less) => `${Math.abs(angle)}° ${angle < 0 ? less : more}`;
+      words.textContent = `${degrees(Math.acos(Math.max(-1, Math.min(1, z))))}° from the camera, ${side(degrees(Math.asin(y)), "up", "down")}, ${side(degrees(Math.atan2(x, z)), "to the right", "to the left")}${model.isBeyond(direction) ? ": beyond the captured lights" : ""}`;
     }
   }
 

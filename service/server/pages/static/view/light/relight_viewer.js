@@ -1,5 +1,6 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
+import { reveal } from "../../api.js";
 import { breath, painted } from "../../breath.js";
 import { element, tell } from "../../element.js";
 import { ViewState } from "../../publish/view_state.js";
@@ -23,6 +24,7 @@ const BACKDROP = 0.2; // encoded grey around the object, the same in light and d
 const AROUND = `rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`;
 const SAME = 0.01; // of a direction
 const REQUESTS = 4; // that the coefficient images come with
+const LATE_MS = 1500; // from which it is said how many have come, and the rest of the page is shown
 const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The frames can still be made by a job, and the captured images looked at.";
 
 /**
@@ -66,6 +68,8 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const tables = view.blocks([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index, relight.matte]);
   const each = Math.ceil(relight.terms / REQUESTS);
   const terms = relight.basis.flatMap((_, at) => (at % each === 0 ? view.blocks(relight.basis.slice(at, at + each)) : []));
+  const coming = element("p", { class: "coming", role: "status" }, `0 of ${relight.terms} coefficient images are here.`);
+  const late = setTimeout(() => { reveal(); stage.append(coming); }, LATE_MS);
   await card.then(showCard, () => {}); // before the graphics processor is waited for
   if (!canRender(drawn)) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
@@ -210,9 +214,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
       change();
       return;
     }
-    const [x, y, z] = place.light;
-    const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
-    move([x * cos - y * sin, x * sin + y * cos, z]); // around the view axis, so that it stays among the captured lights
+    move(turnedAside(place.light, degrees));
   }
 
   drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
@@ -268,7 +270,10 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     const planes = new Uint16Array(await block);
     await renderer.setTerm(term, planes);
     exposure.setTerm(term, planes);
+    coming.textContent = `${term + 1} of ${relight.terms} coefficient images are here.`;
   }
+  clearTimeout(late);
+  coming.remove();
   if (given.includes("environment") && control.environment.value === "") tell("The environment of this address is not on this server. Choose another.");
   if (control.environment.value !== "") {
     const { value } = control.environment;
@@ -296,6 +301,12 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     over: { ...zoomed.over, step: relight.step },
     turn,
   };
+}
+
+/** Return a direction turned around the view axis, so that a light stays among the captured ones. */
+export function turnedAside([x, y, z], degrees) {
+  const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
+  return [x * cos - y * sin, x * sin + y * cos, z];
 }
 
 function decoded(value) {

@@ -14,14 +14,18 @@ const STEPS = 1000;
  * @param {HTMLElement} parent Takes it.
  * @param {any} layer Of view.json.
  * @param {any} codes Of view.json.
- * @param {{low: number, high: number}} look What is shown now.
+ * @param {{low: number, high: number, codes: number[]}} look What is shown now.
  * @param {function({low: number, high: number}): void} changed Called with another range.
  * @param {string} [which] Ends the names of its controls where a page has several.
  */
 export function mountHistogram(parent, layer, codes, look, changed, which = "") {
+  if (layer.kind === "mask") { // its histogram counts codes
+    parent.replaceChildren();
+    return;
+  }
   if (layer.kind === "codes") {
     const names = layer.name === "status" ? (code) => codeWords(codes, code) : (code) => layer.codes?.[code]?.name ?? `${layer.title} ${code}`;
-    parent.replaceChildren(element("ul", { class: "plain legend" }, ...layer.range.filter((code) => code !== 0).map((code) => legend(codeColour(layer, code), names(code)))));
+    parent.replaceChildren(element("ul", { class: "plain legend" }, ...look.codes.filter((code) => code !== 0).map((code) => legend(codeColour(look.codes, code), names(code)))));
     return;
   }
   const { low, high, counts } = layer.histogram;

@@ -114,12 +114,15 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     over = overSelect.value === NONE ? null : new TiledImage(view, view.layer(overSelect.value), draw, failed);
     over?.setLook({ veil: over.layer.name === "confidence" ? "low" : "high" });
     for (const each of [image, other]) each?.setLook(look);
+    const alike = other?.layer.name === image.layer.name ? [image, other] : [image]; // what is compared is shown alike
+    const codes = [...new Set(alike.flatMap(({ layer }) => layer.range))].sort((one, two) => one - two);
+    for (const each of alike) each.setLook({ low: image.look.low, high: image.look.high, codes });
     const kinds = [image, other].map((each) => each?.layer.kind);
     colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
     stopsRow.hidden = !kinds.includes("colour");
     howRow.hidden = other === null;
     wipeRow.hidden = other === null || how.value !== "wipe";
-    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
+    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => alike.forEach((each) => each.setLook(range)));
     if (over === null) overHistogram.replaceChildren();
     else mountHistogram(overHistogram, over.layer, view.info.codes, over.look, (range) => over.setLook(range), " by the grey");
     draw();
@@ -178,11 +181,15 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     event.preventDefault();
     keys[event.key]();
   });
-  if (others.length > 0) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
   const address = new ControlAddress({ layer: layerSelect, with: otherSelect, over: overSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
-  address.read();
+  const given = address.read();
+  if (others.length > 0 && !given.includes("with")) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
   for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
+  layerSelect.addEventListener("input", () => { // another solve is compared layer by layer
+    const [at, name] = otherSelect.value.split("/");
+    if (name === image.layer.name && others[at].view.layer(layerSelect.value) !== undefined) otherSelect.value = `${at}/${layerSelect.value}`;
+  });
   for (const each of [layerSelect, otherSelect, overSelect, how]) each.addEventListener("change", select);
   how.addEventListener("change", () => map.fit());
   wipe.addEventListener("input", draw);

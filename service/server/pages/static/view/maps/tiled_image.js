@@ -24,7 +24,7 @@ export class TiledImage {
     this.#changed = changed;
     this.#failed = failed;
     const [low, high] = layer.kind === "codes" || layer.range.length < 2 ? [0, 1] : layer.range;
-    this.look = { low, high, stops: 0, colours: "viridis", space: view.info.color_space };
+    this.look = { low, high, codes: layer.range, stops: 0, colours: "viridis", space: view.info.color_space };
   }
 
   /** Return the values of a pixel at the whole resolution. */
