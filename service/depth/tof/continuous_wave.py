@@ -20,13 +20,12 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
-from service.depth.tof.inside_out import misread_shape
+from service.depth.tof.inside_out import PHASES, turned_inside_out
 from service.depth.tof.phase_checks import (
     DOUBTED,
     Phases,
     beyond_span,
     full_at,
-    misread_direction,
     misread_frequencies,
     unfitting_images,
     unfitting_pixels,
@@ -232,9 +231,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     if wrong is None:
         amplitude = to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols)
         reversed_m = nearest + (-range_m - nearest) % repeat_m
-        wrong = misread_direction(range_m, reversed_m, amplitude, sure)
-        if wrong is None and rays is not None:
-            wrong = misread_shape(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m)
+        wrong = turned_inside_out(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m, reversal=PHASES)
     if wrong is None:
         wrong = beyond_span(range_m, sure, nearest_m=nearest, repeat_m=repeat_m)
     if wrong is None:

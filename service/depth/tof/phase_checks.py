@@ -41,7 +41,7 @@ STEEPEST, FLATTEST = -4.0, -1.0
 textures."""
 SURE_BLOCK, MOST_BLOCKS, LAWFUL_BLOCKS, FEWEST_BLOCKS = 0.3, 0.7, 0.6, 20
 """Least correlation of brightness and range in a block that tells a sign, share of such blocks in which surfaces grow brighter with the
-distance and share of these in which the brightness falls as light does if phases run backwards, from which on they do, and number of blocks
+distance and share of these in which the brightness falls as light does if ranges run backwards, from which on they do, and number of blocks
 that tell it. Bowls and hollows with bright paint have 0.45 of lawful blocks at most, rooms 0.74 at least."""
 UNFIT_TIMES, UNFIT_PART = 4.0, 0.2
 """Variance that the wave of a frequency leaves of its images, over that of their neighbours in a row, and its root over the amplitude, from
@@ -158,16 +158,16 @@ def _between(phase: np.ndarray, axis: int) -> np.ndarray:
 
 
 def misread_direction(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray) -> str | None:
-    """Return that the phases look declared backwards, as a sentence; None if light does not fall off more rightly so.
+    """Return how the brightness of surfaces tells that ranges run backwards, in words; None if light does not fall off more rightly so.
 
-    That surfaces grow brighter with the distance is not enough: the walls of a bowl do, and paint that is bright behind. If the phases run
+    That surfaces grow brighter with the distance is not enough: the walls of a bowl do, and paint that is bright behind. If the ranges run
     backwards the brightness follows the true distances, and falls with these as light does.
 
     Source: Horn, "Obtaining shape from shading information", 1975: under a source at the camera, a plane's light falls with the cube of the
     distance.
 
     Args:
-        range_m, reversed_m: [rows, cols] metres, as declared and if phases run backwards.
+        range_m, reversed_m: [rows, cols] metres, as declared and if ranges run backwards.
         amplitude: [rows, cols], in any unit.
         sure: [rows, cols] bool, pixels with a range.
     """
@@ -190,8 +190,7 @@ def misread_direction(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np
     share = float(brighter.sum() / tells.sum()) if tells.sum() >= FEWEST_BLOCKS else 0.0
     if share < MOST_BLOCKS or ((power >= STEEPEST) & (power <= FLATTEST))[brighter].mean() < LAWFUL_BLOCKS:
         return None
-    return (f"frames[].tof.reference_phase_rad: in {100 * share:.0f} % of the scene surfaces grow brighter with the distance, as if the "
-            "phases ran backwards: check the order of the images, and the sign of reference_phase_rad; no range is believed")
+    return f"in {100 * share:.0f} % of the scene surfaces grow brighter with the distance"
 
 
 def unfitting_images(images: np.ndarray, hz: np.ndarray, reference_phase_rad: np.ndarray, scale: np.ndarray,

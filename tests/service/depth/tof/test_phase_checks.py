@@ -6,7 +6,7 @@ import pytest
 
 from tests.reference import tof
 from tests.scenes.depth import depth_of
-from tests.scenes.tof import cw_frames, write
+from tests.scenes.tof import cw_frames, pulsed_frames, write
 
 ROWS, COLS = 72, 96
 VIEW = tof.room(ROWS, COLS)
@@ -84,7 +84,17 @@ def test_planes_with_texture_tell_that_phases_run_backwards(tmp_path, hz):
     assert not right.warnings and right.maps.mask.mean() > 0.95
     result = measured(tmp_path / "backwards", images, [backwards(*setting) for setting in settings])
     assert not result.maps.mask.any()
-    assert "plane if the phases run backwards" in result.warnings[0]
+    assert "plane if ranges are reversed" in result.warnings[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("reverse", [True, False], ids=["last bin first", "right"])
+def test_histograms_whose_last_bin_comes_first_are_named(tmp_path, reverse):
+    counts = tof.histogram(textured(curved=False), 20000, bins=48, bin_s=4e-10, sigma_s=5e-10, seed=3)
+    write(tmp_path, pulsed_frames(counts[..., ::-1] if reverse else counts, bin_s=4e-10),
+          camera={"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]})
+    result = depth_of(tmp_path)
+    assert any("check the order of the bins" in said for said in result.warnings) == reverse and (result.maps.mask.mean() > 0.95) != reverse
 
 
 @pytest.mark.parametrize("hz", [HZ, (12e6,)], ids=["three", "one"])
