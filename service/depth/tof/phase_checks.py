@@ -6,7 +6,7 @@ the distance, where light falls off with its square. Both are only looked for; a
 not.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -82,12 +82,14 @@ class Phases(NamedTuple):
         return Phases((self.phase * sign[:, None, None] % (2 * np.pi))[order], self.sigma[order], hz[order])
 
 
-def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float]) -> str | None:
+def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float],
+                        others: Iterable[tuple[Phases, str]]) -> str | None:
     """Return how frequencies are declared wrongly, as a sentence; None if none is, or no other reading fits.
-    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases."""
+    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases. `others`: further readings, each with
+    what to check."""
     if declared >= AGREE or len(phases.hz) < 2:
         return None
-    tried = [(agreeing(other), words) for other, words in _readings(phases)]
+    tried = [(agreeing(other), words) for other, words in (*_readings(phases), *others)]
     best, words = next(found for found in tried if found[0] >= max(tried)[0] - AS_GOOD)  # exchanged ones come first
     if best < max(CLEAR_SHARE, CLEAR_TIMES * declared):
         return None
@@ -123,7 +125,8 @@ def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
 def _words(declared_hz: float, found_hz: float, *, backwards: bool) -> str:
     declared = f"{declared_hz / 1e6:g} MHz"
     what = [f"{declared} are {found_hz / 1e6:g} MHz: check modulation_hz"] if found_hz != declared_hz else []
-    return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad"] if backwards else what)
+    return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad and the "
+                               "order of the images"] if backwards else what)
 
 
 def _ratio(phases: Phases, one: int, other: int) -> float | None:

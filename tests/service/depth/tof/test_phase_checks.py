@@ -4,6 +4,7 @@ noise are those of tests/reference/tof.py."""
 import numpy as np
 import pytest
 
+from tests.marks import first_short
 from tests.reference import tof
 from tests.scenes.depth import depth_of
 from tests.scenes.tof import cw_frames, pulsed_frames, write
@@ -72,6 +73,25 @@ def backwards(hz, delta):
 def test_a_wrong_declaration_is_named(tmp_path, hz, phases, declared, words):
     images, settings = under(hz, phases)
     result = measured(tmp_path, images, [declared(*setting) for setting in settings])
+    assert not result.maps.mask.any() and words in result.warnings[0]
+
+
+def without(images, lost, of=None):
+    images = images.copy()
+    images[lost] = 3.0 if of is None else images[of] if isinstance(of, int) else of * images[lost]
+    return images
+
+
+@first_short(("hz", "fault", "words"), [
+    (HZ, lambda images: without(images, 4, 0.8), "50 MHz at 120° is 0.8 times"),
+    (HZ, lambda images: images[[1, 0, *range(2, 9)]], "order 2, 1, 3"),
+    ((60e6,), lambda images: without(images, 1, 0), "shows what that at 0° shows"),
+    ((60e6,), lambda images: without(images, 2), "60 MHz at 240° has one reading"),
+], ids=["darker", "exchanged", "shown twice", "blank"])
+def test_an_image_of_three_is_named(tmp_path, hz, fault, words):
+    """Three images fit any wave: they were wiggling or fog, and under one frequency believed without a word."""
+    images, settings = under(hz, 3)
+    result = measured(tmp_path, fault(images), settings)
     assert not result.maps.mask.any() and words in result.warnings[0]
 
 
