@@ -224,7 +224,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     phase, spread = (to_numpy(array)[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
     size_rad = np.inf
     wrong = unfitting_images(frames.images, frames.modulation_hz, frames.reference_phase_rad, frames.scale, whole)
-    if wrong is None and whole.any():
+    if wrong is None:
         wrong = lost_images(frames, whole.reshape(-1))
     if wrong is None and lit.any():
         read = Phases(phase, spread, found.modulation_hz)

@@ -22,7 +22,7 @@ LARGEST_RAD = 0.7
 CLEAR_SIGMAS = 5.0
 """Least change of the phase that others are compared with, in its standard deviations: noise then hardly dilutes their ratio."""
 ENOUGH = 200
-"""Number of neighbours that tell a ratio."""
+"""Number of neighbours that tell a ratio, and of pixels that tell what an image shows."""
 AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.6, 2.0
 """Share of the pixels whose frequencies agree, from which on the frequencies are not doubted; least share with which another reading is
 named, and how many times that of the declared one it must be."""

@@ -10,7 +10,7 @@ from itertools import permutations
 import numpy as np
 
 from kernels.tof.continuous.continuous import LEAST_PHASES, weights
-from service.depth.tof.phase_checks import Phases
+from service.depth.tof.phase_checks import ENOUGH, Phases
 from stage.tof.raw_frames import CorrelationImages
 
 CHANCE, SHOWN = 4.0, 10.0
@@ -22,8 +22,8 @@ LEAST_FACTOR, MOST_FACTOR = 1.05, 20.0
 
 def lost_images(frames: CorrelationImages, usable: np.ndarray) -> str | None:
     """Return that an image of a frequency with three shows nothing, or what another shows but for noise, as a sentence; None where none
-    does. `usable`: [rows · cols] bool."""
-    for hz, own in _threes(frames):
+    does, or fewer than ENOUGH pixels tell it. `usable`: [rows · cols] bool."""
+    for hz, own in _threes(frames) if usable.sum() >= ENOUGH else ():
         shown = frames.images[own][:, usable].astype(np.float64) * frames.scale[own, None]
         for k, (i, j) in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
             last, one, other = shown[[k, i, j]]
