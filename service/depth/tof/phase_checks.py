@@ -23,13 +23,15 @@ CLEAR_SIGMAS = 5.0
 """Least change of the phase that others are compared with, in its standard deviations: noise then hardly dilutes their ratio."""
 ENOUGH = 200
 """Number of neighbours that tell a ratio, and of pixels that tell what an image shows."""
-AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.6, 2.0
+AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.85, 2.0
 """Share of the pixels whose frequencies agree, from which on the frequencies are not doubted; least share with which another reading is
 named, and how many times that of the declared one it must be."""
 AS_GOOD = 0.02
 """Share of the pixels by which one reading may be worse than another and still be named in its place."""
 STEP_HZ, UNSURE_RATIO = 1e6, 0.04
 """Steps of the frequencies that are tried, and the part by which changes of phases leave their ratio open: wiggling and edges bend it."""
+NARROW = 0.995
+"""Mean of the unit vectors of a phase from which on it spans too little, a third of a radian: there wiggling makes any ratio."""
 BLOCKS = 12
 """Number of blocks in each direction of an image in which the brightness is compared with the range."""
 IN_A_BLOCK = 20
@@ -108,8 +110,10 @@ def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
         swapped[[a, b]] = hz[[b, a]]
         yield phases.changed(swapped, same), f"{hz[a] / 1e6:g} and {hz[b] / 1e6:g} MHz are exchanged: check modulation_hz"
     seen: set[tuple[int, float]] = set()
+    spans = [abs(np.exp(1j * phase[sigma > 0]).mean()) < NARROW if (sigma > 0).any() else False
+             for phase, sigma in zip(phases.phase, phases.sigma, strict=True)]
     for known, other in permutations(range(len(hz)), 2):
-        ratio = _ratio(phases, other, known)
+        ratio = _ratio(phases, other, known) if spans[known] and spans[other] else None
         if ratio is None:
             continue
         least, most = (round((1 + part) * abs(ratio) * hz[known] / STEP_HZ) for part in (-UNSURE_RATIO, UNSURE_RATIO))
