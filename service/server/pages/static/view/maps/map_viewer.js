@@ -119,10 +119,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     stopsRow.hidden = !kinds.includes("colour");
     howRow.hidden = other === null;
     wipeRow.hidden = other === null || how.value !== "wipe";
-    const alike = other?.layer.kind === "scalar" && other.layer.name === image.layer.name ? [image, other] : [image];
-    const range = { low: Math.min(...alike.map((each) => each.look.low)), high: Math.max(...alike.map((each) => each.look.high)) };
-    for (const each of alike) each.setLook(range); // of two solves, too, a value has one colour
-    mountHistogram(histogram, image.layer, view.info.codes, image.look, (changed) => alike.forEach((each) => each.setLook(changed)));
+    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
     if (over === null) overHistogram.replaceChildren();
     else mountHistogram(overHistogram, over.layer, view.info.codes, over.look, (range) => over.setLook(range), " by the grey");
     draw();
