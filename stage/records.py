@@ -79,10 +79,10 @@ def faults_of(error: ValidationError, name: FieldName | None = None, within: tup
     places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
     named = [(fault, (name or field_name)((*within, *fault["loc"]))) for fault in error.errors()
              if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list
-    return [f"{where}: {_said(fault)}" if where else _said(fault) for fault, where in named]
+    return [f"{where}: {said(fault)}" if where else said(fault) for fault, where in named]
 
 
-def _said(fault: Any) -> str:
+def said(fault: Any) -> str:
     """Return what is wrong with the value of a field, from an entry of `ValidationError.errors`."""
     match fault["type"]:
         case "extra_forbidden":

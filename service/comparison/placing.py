@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.comparison.surfaces import Design, Offsets, ScannedSurface
+from service.comparison.surfaces import STRAY, Design, Offsets, ScannedSurface
 from service.scans.points.cloud import Cloud, Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, moved
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
@@ -36,6 +36,8 @@ RIVAL = 1.5
 LARGER, SMALLER = 4.0, 0.02
 """The sizes of a scan, in that of the design, beyond which their units are not the same: a fixture may lie around a part, and a scan may
 show a small piece of it."""
+BESIDE = 1.5
+"""Distance along an axis from the middle of points beyond which one is stray, in the longest side of the box around them."""
 LEAST_SHARE = 0.5
 """The least part of a scan that must lie on the design."""
 USUAL = 0.8
@@ -176,8 +178,10 @@ def _rough(design: Design, scan: ScannedSurface) -> tuple[list[np.ndarray], np.n
 
 
 def _cloud(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray, cell: float) -> Cloud:
-    """Return points as registration uses them, whose normals point outward; points without a normal are left out."""
-    known = np.linalg.norm(normals, axis=1) > 0.5
+    """Return points as registration uses them, whose normals point outward; points without a normal, and far stray ones, are left out."""
+    low, high = np.quantile(points, (STRAY, 1 - STRAY), axis=0)
+    around = np.abs(points - (low + high) / 2).max(axis=1) < BESIDE * (high - low).max()
+    known = (np.linalg.norm(normals, axis=1) > 0.5) & around
     thinned = thin(points[known], -normals[known], sigma[known] ** 2, cell)
     whole = np.linalg.norm(thinned.directions, axis=1) > 0.5  # the mean of both sides of a thin wall has no direction
     return cloud_of(Thinned(*(each[whole] for each in thinned[:3])), most=ROUGH_POINTS)

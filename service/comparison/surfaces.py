@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kernels.surface.nearest import NearestOnMesh
 from service.scans.fusion.fuse import MESH_FILE
@@ -150,6 +151,9 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
     normals = np.nan_to_num(normals, posinf=0, neginf=0)
     outward = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    bare = ~outward.any(axis=1)
+    if faces is None and bare.any() and not bare.all():  # they face as the nearest point does that has a normal
+        outward[bare] = outward[~bare][cKDTree(points[~bare]).query(points[bare])[1]]
     source = "declared" if sigma_m is not None else "measured" if sigma is not None else "estimated"
     if sigma_m is not None:
         spread = np.full(len(points), sigma_m)

@@ -61,8 +61,9 @@ WORTH_SAYING = 0.01
 
 
 def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilated, exposure: np.ndarray,
-                   environments: Environments | None) -> list[str]:
-    """Return what the user should know, a sentence each; the levels are those of the light times the exposure [frames]."""
+                   environments: Environments | None, rounded: np.ndarray) -> list[str]:
+    """Return what the user should know, a sentence each; the levels are those of the light times the exposure [frames]. `rounded`: [frames]
+    error of the irradiance that the steps of the lamps make."""
     found = []
     if (faults := list(patch_faults(rig))):
         found.append(f"{len(faults)} faults of the patch keep lamps dark in relit play, the first: {faults[0]} (relit rig check)")
@@ -74,6 +75,9 @@ def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilate
     total = np.maximum(light.energy.sum(axis=(1, 2)) * exposure, np.finfo(float).tiny)
     if (gamut := float((wanted.out_of_gamut.sum(axis=1) / total).max())) > WORTH_SAYING:
         found.append(f"the colours of the lamps miss up to {gamut:.0%} of the light: its colours lie outside theirs")
+    if (most := float(rounded.max())) > WORTH_SAYING:
+        found.append(f"the steps of the lamps and the least light that they hold make up to {most:.0%} of error: give more exposure, or "
+                     "lamps of finer steps")
     if environments is not None and environments.clipped:
         found.append(f"{sum(environments.clipped.values())} pixels of environments were negative and are 0")
     return [*found, *(environments.doubts() if environments is not None else [])]

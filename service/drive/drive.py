@@ -105,7 +105,7 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     judgement, unrounded = (judge_all(light, level, rig, factor) for level in (quantised.level, dilated.level))
     timings.advance(4)
     shown = None if chart is None else view_chart(chart, rig, light.far, quantised.level, factor)
-    warnings = tuple(drive_warnings(rig, light, wanted, dilated, factor, environments))
+    warnings = tuple(drive_warnings(rig, light, wanted, dilated, factor, environments, judgement.rms - unrounded.rms))
     rate = request.frames_per_second or (None if keys is None else keys.frames_per_second) or FRAMES_PER_SECOND
     sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers, shown)
     timings.stage("files", 1)

@@ -19,7 +19,8 @@ from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from kernels.surface.slopes import STEEPEST
 from service.joining.correction import correct
 from service.joining.depth_steps import SLOPE_ERROR, Edges, find_steps
-from service.joining.relief import relief_factor, relief_shift_px
+from service.joining.relief import fine_relief, relief_factor, relief_shift_px
+from service.joining.rounding import rounding_step
 from service.light_estimation.lambertian import degrees_between
 from stage.spread import MAD_TO_SIGMA
 
@@ -27,6 +28,8 @@ LEAST_DEPTHS = 12
 """Number of depths by which a part is placed; one with fewer has no place of its own."""
 TURN = 0.05
 """Angle, radians, by which normals are turned about the image's axes to tell what turned lights make of their heights."""
+ROUNDED = np.sqrt(12)
+"""A step over the standard deviation of errors that are uniform over it."""
 MOST_NOISE, MOST_EDGES = 1000.0, 300_000
 """The largest factor of the noise that is looked for, and the edges that tell it."""
 
@@ -42,9 +45,12 @@ class Joined(NamedTuple):
     rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, lie alone, or contradict those around them
     guessed: np.ndarray  # [rows, cols] bool, beside a step without a depth of its own: which side it belongs to is a guess
     unexplained: float | None
-    """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
+    """Part of the variance of the relief of the depths, without their noise, that the integrated normals leave beside what a tilt of 5° or
+    of their σ makes: of the fine relief, or of all where there is none; None: there is no relief."""
+    step_m: float
+    """Median step to which depths are rounded; 0 where they are not."""
     noise_factor: float
-    """By which the noise of the depths exceeds their standard deviations."""
+    """By which the noise of the depths exceeds their standard deviations, with their rounding."""
     factor: float
     """By which the relief of the depth exceeds that of the normals; 1 where it is not sure to."""
     shift_px: tuple[float, float]
@@ -81,6 +87,8 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     own_error = plane.slope_error(slopes, normal_sigma)
     error = plane.slope_error(slopes, normal_sigma + SLOPE_ERROR)
     right, down = (_edges(plane, normal, slopes, error, solved, axis) for axis in (1, 0))
+    rounding = rounding_step(u, both, right, down)
+    u_sigma = np.hypot(u_sigma, rounding / ROUNDED)
     noise_factor = noise_over_sigma(u, u_sigma, both, right, down)
     u_sigma = u_sigma * noise_factor
     cuts = find_steps(u, u_sigma, both, right, down)
@@ -96,7 +104,8 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
     known = both & cuts.depth & (part >= 0)  # a pixel with a step on every side is of no part
     placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~known
-    unlike, left, shared, one_sided = 0.0, 0.0, 0.0, 0.0
+    unlike, left, shared, one_sided = np.zeros(2), np.zeros(2), 0.0, 0.0
+    angle = max(SLOPE_ERROR, float(np.median(normal_sigma[solved])))
     largest = int(np.bincount(part[known]).argmax()) if known.any() else -1
     factor = relief_factor(u, u_sigma, base, known & (part == largest), part)
     base = base * factor
@@ -119,12 +128,13 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         placed[box][here] = True
         rejected[box][fixed.rejected] = True
         used = seen & ~fixed.rejected
-        unlike += _variation(u[box][used], u_sigma[box][used])
-        left += _variation((u - base)[box][used], u_sigma[box][used])
+        tilts = (np.tan(angle) * place for place in np.indices(used.shape))
+        for total, heights, share in ((unlike, u[box], 1.0), (left, (u - base)[box], 1.0), *((left, tilt, -0.5) for tilt in tilts)):
+            total += [share * _variation(each[used], u_sigma[box][used]) for each in (heights, fine_relief(heights, used))]
     variance += shifted**2
     turn = degrees_between(normal, plane.turned(normal.astype(np.float64), slopes, correction, part, solved))[placed]
     contradicted = float(np.median(turn)) if turn.size else 0.0
-    if contradicted <= np.degrees(max(SLOPE_ERROR, float(np.median(normal_sigma[solved])))):
+    if contradicted <= np.degrees(angle):
         contradicted = 0.0
     disputed = (1 - 1 / factor) * base + (correction if contradicted else 0)
     if placed.any():  # which of the two is right, and where their surfaces meet, is unknown
@@ -136,9 +146,10 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     if unplaced.any():
         known_z = z[placed].mean() if placed.any() else mean_z
         z = np.where(unplaced, to_numpy(found.height) + (known_z - mean_z), z)
-    shared_m, one_sided_m = (float(plane.to_depth_sigmas(np.array(mean_z), np.array(error))) for error in (shared, one_sided))
+    step_m, shared_m, one_sided_m = (float(plane.to_depth_sigmas(np.array(mean_z), np.array(error)))
+                                     for error in (np.median(rounding[both]), shared, one_sided))
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
-                  None if unlike == 0 else left / unlike, noise_factor, factor, shift_px,
+                  _unexplained(unlike, left), step_m, noise_factor, factor, shift_px,
                   shared_m, one_sided_m, contradicted)
 
 
@@ -156,6 +167,12 @@ def _variation(values: np.ndarray, sigma: np.ndarray) -> float:
     found = float((weight * (values - np.average(values, weights=weight)) ** 2).sum())
     expected = len(values) - 1
     return found - expected if found > expected + 3 * np.sqrt(2 * expected) else 0.0
+
+
+def _unexplained(unlike: np.ndarray, left: np.ndarray) -> float | None:
+    """Return the part of the variation of depths, [whole, fine], that is left."""
+    scale = 1 if unlike[1] > 0 else 0
+    return float(max(left[scale], 0) / unlike[scale]) if unlike[scale] > 0 else None
 
 
 def noise_over_sigma(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, right: Edges, down: Edges) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import Status
 from service.errors import RequestError
-from service.joining.depth_and_normals import Joined, join_depth
+from service.joining.depth_and_normals import ROUNDED, Joined, join_depth
 from service.light_estimation.lambertian import degrees_between
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
@@ -29,7 +29,7 @@ CAMERA_TOLERANCE = 1e-3
 ROUNDING = 1e-9
 """What rounding leaves of a number of a pose or a distortion that is 0."""
 CONTRADICTION = 0.5
-"""Part of the relief of the depth that normals may leave unexplained before the two are refused as not of one surface: it is below .01
+"""Part of the relief of the depth that normals may leave unexplained before the two are refused as not of one surface: it is below .1
 where they are, and above 1 where the normals point another way."""
 NOISIER, SHARED = 1.5, 0.5
 """Noise of the depth over its standard deviation, and errors that neighbours share over that, from which they are said."""
@@ -131,7 +131,8 @@ def _facts(maps: SurfaceMaps, depth: DepthMaps, joined: Joined, overlap: int) ->
         "sigma_m": {"depth_median": _median(before), "joined_median": _median(joined.sigma[placed])},
         "normals_turned_degrees": {"median": _median(turned), "p95": round(float(np.percentile(turned, 95)), 4) if turned.size else 0.0},
         "parts": int(joined.part.max()) + 1,
-        "depth_noise_factor": round(joined.noise_factor, 3), "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
+        "depth_step_m": float(f"{joined.step_m:.3g}"), "depth_noise_factor": round(joined.noise_factor, 3),
+        "depth_shared_error_m": float(f"{joined.shared_m:.3g}"),
         "contradicted_degrees": round(joined.contradicted_degrees, 2), "depth_one_sided_m": float(f"{joined.one_sided_m:.3g}"),
         "normals_factor": round(joined.factor, 4), "depth_shift_px": [round(pixels, 2) for pixels in joined.shift_px],
         "relief_unexplained": None if joined.unexplained is None else round(joined.unexplained, 5),
@@ -147,6 +148,9 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
     if (shared := facts.get("calibration_sigma_m", 0.0)) > (own := facts["sigma_m"]["joined_median"]) > 0:
         found.append(f"depth: its calibration leaves {shared:.3g} m open of all depths together, {shared / own:.2g} times height_sigma "
                      "(median), which does not hold what all pixels share")
+    if (step := facts["depth_step_m"]) > ROUNDED * (sigma := facts["sigma_m"]["depth_median"]):
+        found.append(f"depth: its values lie in steps of {step:.2g} m, {step / sigma:.2g} times sigma.Z: their rounding counts as noise; "
+                     "write them with more digits")
     if facts["depth_noise_factor"] > NOISIER:
         found.append(f"depth: its noise is {facts['depth_noise_factor']:.2g} times sigma.Z, and counts as such")
     if facts["depth_shared_error_m"] > SHARED * facts["sigma_m"]["depth_median"]:

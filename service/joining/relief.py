@@ -52,8 +52,8 @@ def relief_factor(height: np.ndarray, sigma: np.ndarray, base: np.ndarray, known
     at = _pixels(base, known, part)
     if at is None:
         return 1.0
-    design = np.stack([_fine(plane, at.inside)[at.rows, at.cols] for plane in at.terms], axis=1)
-    values, error = _fitted(design, _fine(height - base, at.inside)[at.rows, at.cols], sigma, at)
+    design = np.stack([fine_relief(plane, at.inside)[at.rows, at.cols] for plane in at.terms], axis=1)
+    values, error = _fitted(design, fine_relief(height - base, at.inside)[at.rows, at.cols], sigma, at)
     factor = 1 + float(values[0])
     return factor if abs(values[0]) > max(SURE * error[0], LEAST_FACTOR) and 1 / MOST_FACTOR < factor < MOST_FACTOR else 1.0
 
@@ -108,8 +108,8 @@ def _fitted(design: np.ndarray, wanted: np.ndarray, sigma: np.ndarray, at: _Pixe
     return values, np.sqrt(np.diag(between_blocks(inverse, design * (used * left)[:, None], at.cols, at.rows)))
 
 
-def _fine(plane: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return a map without what is wider than the cells of the scale."""
+def fine_relief(plane: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return a map without what is wider than the cells of the scale, [rows, cols], where it is `inside`."""
     held = inside.astype(np.float64)
     count = sum_cells(held, WIDE)
     mean = sum_cells(np.where(inside, plane, 0), WIDE) / np.where(count > 0, count, 1)

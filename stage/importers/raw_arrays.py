@@ -20,6 +20,16 @@ from stage.tof.raw_frames import read_array
 SUFFIXES = (".npy", ".npz", ".mat", ".json", ".bin", ".raw", ".dat")
 RAW = (".bin", ".raw", ".dat")
 """Suffixes of files that are numbers alone, whose shape and type are told."""
+LEAST_NUMBERS, SAMPLE = 1000, 65536
+"""Numbers of a raw file that tell the order of their bytes, and how many of them are compared."""
+ROUGHER = 1.25
+"""How much rougher whole numbers are in one order of bytes than in the other from which on they are of the other one: what varies least
+from neighbour to neighbour are the high bytes, and right files are not rougher by more than 1.01."""
+LOW_BYTES, DIFFERENT = 0.1, 10
+"""Share of the numbers whose lowest byte is not 0 below which, and number of different ones above which, the bytes are of the other
+order."""
+LARGEST = 1e15
+"""Largest size, and its inverse the least, of a number that a sensor writes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +86,42 @@ class ArrayFiles:
         if not content or len(content) % one:
             raise ManifestError(f"{path}: has {len(content)} bytes, which is no whole number of images of {width}x{height} {kind} "
                                 f"({one} bytes)")
-        return np.frombuffer(content, kind).reshape(-1, height, width)
+        values = np.frombuffer(content, kind)
+        other = values.view(kind.newbyteorder())
+        if len(values) >= LEAST_NUMBERS and (_misread if kind.kind == "f" else _rougher)(values, other, (1, width, width * height)):
+            raise ManifestError(f"--dtype {self.dtype}: the numbers of {path} are {other.dtype.str}, in the other order of their bytes, in "
+                                f"which neighbours are alike: give --dtype '{other.dtype.str}'")
+        return values.reshape(-1, height, width)
+
+
+def _misread(values: np.ndarray, other: np.ndarray, _: tuple[int, ...]) -> bool:
+    """Return whether most numbers of floating point are of no measurement, and in the other order of bytes all are."""
+    def measured(numbers: np.ndarray) -> float:
+        size = np.abs(numbers[numbers != 0])
+        return float(((size > 1 / LARGEST) & (size < LARGEST)).mean()) if len(size) else 1.0
+
+    return measured(values) < 0.5 and measured(other) == 1
+
+
+def _rougher(values: np.ndarray, other: np.ndarray, steps: tuple[int, ...]) -> bool:
+    """Return whether neighbours at one of the distances differ less, beside any two numbers, in the other order of bytes; or whether the
+    lowest byte is 0 in most numbers and different in others, as of counts of which few are above 255."""
+    low = values[values != 0] & 0xff
+    if len(low) and (low != 0).mean() < LOW_BYTES and len(np.unique(low)) > DIFFERENT:
+        return True
+    random = np.random.default_rng(0)
+
+    def rough(numbers: np.ndarray) -> float:
+        one, any_other = (numbers[random.integers(len(numbers), size=SAMPLE)].astype(np.float64) for _ in range(2))
+        apart = max(float(np.abs(one - any_other).mean()), 1e-300)
+        place = random.integers(len(numbers), size=SAMPLE)
+        return min(float(np.abs(numbers[inside].astype(np.float64) - numbers[inside + step]).mean()) / apart
+                   for step in steps if len(inside := place[place + step < len(numbers)]))
+
+    def unsigned(numbers: np.ndarray) -> np.ndarray:  # signs of exchanged bytes heap the numbers at two ends
+        return numbers.view(numbers.dtype.str.replace("i", "u"))
+
+    return min(rough(values), rough(unsigned(values))) > ROUGHER * max(rough(other), rough(unsigned(other)))
 
 
 def _chosen(path: Path, arrays: dict[str, np.ndarray], wanted: Sequence[str]) -> Sequence[str]:

@@ -2,6 +2,7 @@
 than the card."""
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,12 @@ CELLS = 48
 """Squares across an image whose means are looked at: their noise is little."""
 FALL = 0.15
 """Part by which the light on a card may fall from one side of the image to the other; lenses darken all sides alike."""
+OFF_MIDDLE, TRIED = 0.15, 9
+"""Largest distance of the middle of a lens from that of the image, in halves of the width, and number of places that are tried along it."""
+LENS_TERMS = 5
+"""Powers of the square of the distance from its middle, from 0 on, that describe the logarithm of the light of a lens."""
+SAME = 0.003
+"""By how much more one middle may leave than another (RMS) and not be told from it."""
 ROUGH = 0.03
 """Root mean square deviation of a card from an even fall and a lens."""
 MIXED = 0.05
@@ -78,12 +85,9 @@ def card_faults(card: np.ndarray, mask: np.ndarray) -> tuple[str, ...]:
     known = np.flatnonzero(count)
     light, x, y = (np.bincount(cell, values, CELLS * CELLS)[known] / count[known]
                    for values in (grey[v, u], 2 * (u + 0.5) / width - 1, 2 * (v + 0.5) / height - 1))
-    across = (x**2 * width**2 + y**2 * height**2) / (width**2 + height**2)
-    design = np.column_stack([np.ones(len(known)), x, y, across, across**2])
-    weight = np.sqrt(count[known])[:, None]
-    values = np.linalg.lstsq(design * weight, np.log(light)[:, None] * weight)[0][:, 0]
-    fall = 1 - float(np.exp(-np.ptp(design[:, 1:3] @ values[1:3])))
-    rough = float(np.sqrt(np.average((np.log(light) - design @ values) ** 2, weights=count[known])))
+    fits = [_lens_fit(x, y * height / width, middle, np.log(light), count[known]) for middle in _middles()]
+    rough = min(fit[1] for fit in fits)
+    fall = min(fit[0] for fit in fits if fit[1] <= rough + SAME)
     faults = []
     if fall > FALL:
         faults.append(f"the light on the card falls by {100 * fall:.0f} % from one side of the image to the other, which no lens makes: "
@@ -92,6 +96,23 @@ def card_faults(card: np.ndarray, mask: np.ndarray) -> tuple[str, ...]:
         faults.append(f"the card is uneven by {100 * rough:.1f} % (RMS) beside what a lens makes: let a plain card fill the images, "
                       "without shadows, and out of focus")
     return tuple(faults)
+
+
+def _middles() -> Iterator[tuple[float, float]]:
+    """Yield the places that are tried for the middle of a lens, from that of the image, in halves of its width."""
+    for x, y in product(np.linspace(-OFF_MIDDLE, OFF_MIDDLE, TRIED), repeat=2):
+        if np.hypot(x, y) <= OFF_MIDDLE + 1e-9:
+            yield float(x), float(y)
+
+
+def _lens_fit(x: np.ndarray, y: np.ndarray, middle: tuple[float, float], level: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Return the part by which the light of cells falls across them beside a lens, and the root mean square of what both leave.
+    `x, y`: [cells] in halves of the width. `level`: [cells] logarithm of the light. `weight`: [cells] number of pixels."""
+    across = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
+    design = np.column_stack([x, y, *(across / max(across.max(), 1e-9)) ** np.arange(LENS_TERMS)[:, None]])
+    values = np.linalg.lstsq(design * np.sqrt(weight)[:, None], level * np.sqrt(weight))[0]
+    rough = float(np.sqrt(np.average((level - design @ values) ** 2, weights=weight)))
+    return 1 - float(np.exp(-np.ptp(design[:, :2] @ values[:2]))), rough
 
 
 def mixed_colours(region: np.ndarray) -> float | None:

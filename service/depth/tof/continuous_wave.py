@@ -20,18 +20,18 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
-from service.depth.tof.inside_out import misread_shape
+from service.depth.tof.inside_out import PHASES, turned_inside_out
 from service.depth.tof.phase_checks import (
     DOUBTED,
     Phases,
     beyond_span,
     full_at,
-    misread_direction,
     misread_frequencies,
     unfitting_images,
     unfitting_pixels,
     unfitting_share,
 )
+from service.depth.tof.three_images import lost_images, other_images
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -224,21 +224,22 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     phase, spread = (to_numpy(array)[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
     size_rad = np.inf
     wrong = unfitting_images(frames.images, frames.modulation_hz, frames.reference_phase_rad, frames.scale, whole)
+    if wrong is None:
+        wrong = lost_images(frames, whole.reshape(-1))
     if wrong is None and lit.any():
-        wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing)
+        read = Phases(phase, spread, found.modulation_hz)
+        wrong = misread_frequencies(read, declared, agreeing, other_images(frames, read))
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
     repeat_m = common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
     range_m = to_numpy(ranges.range)[:pixels].reshape(rows, cols)
     if wrong is None:
         amplitude = to_numpy(found.amplitude)[-1, :pixels].reshape(rows, cols)
         reversed_m = nearest + (-range_m - nearest) % repeat_m
-        wrong = misread_direction(range_m, reversed_m, amplitude, sure)
-        if wrong is None and rays is not None:
-            wrong = misread_shape(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m)
+        wrong = turned_inside_out(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m, reversal=PHASES)
     if wrong is None:
         wrong = beyond_span(range_m, sure, nearest_m=nearest, repeat_m=repeat_m)
     if wrong is None:
-        size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
+        size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz), (found.freedom == 0).any())
     if wrong is not None and size_rad > SCATTERED_RAD:
         confidence = confidence * DOUBTED
     else:
@@ -271,9 +272,9 @@ def _with_phases(found: Correlation, other: Phases) -> Correlation:
     return found._replace(phase=arrays[0], sigma=arrays[1], modulation_hz=other.hz)
 
 
-def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[float, str | None]:
+def _disagreement(further: np.ndarray, calibrated: bool, threes: bool) -> tuple[float, str | None]:
     """Return by how much the frequencies disagree beyond noise, radians (`further`, τ² of `widen`), and a sentence if they do over most of
-    the scene."""
+    the scene. `threes`: whether a frequency has three images, which any wave fits."""
     part = float((further > 0).mean()) if further.size else 0.0
     if part < MOST_OF_SCENE:
         return 0.0, None
@@ -282,9 +283,10 @@ def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[float, str | N
               else "measure the wiggling with relit calibrate tof and give --tof-calibration")
     so = ("no range is believed, because wiggling seldom bends phases by that much" if size_rad > SCATTERED_RAD
           else "the standard deviations hold what the frequencies disagree by, not an error that they share")
+    image = ", or by an image that is not that of its phase" if threes else ""
     return size_rad, (f"frames[].tof: the phases of the frequencies disagree by {1000 * size_rad:.0f} mrad more than noise at "
-                      f"{100 * part:.0f} % of the pixels, by wiggling or by light that comes over several ways, as in fog: {advice}, and "
-                      f"modulation_hz; {so}")
+                      f"{100 * part:.0f} % of the pixels, by wiggling or by light that comes over several ways, as in fog{image}: "
+                      f"{advice}, and modulation_hz; {so}")
 
 
 def _noise(frames: CorrelationImages, calibration: TofCalibration, whole: np.ndarray) -> tuple[Noise, str]:

@@ -16,6 +16,8 @@ from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
 from service.depth.base.solution import RangeImage
 from service.depth.tof.count_scale import CountScale, estimate_count_scale
+from service.depth.tof.inside_out import BINS, turned_inside_out
+from service.depth.tof.phase_checks import DOUBTED
 from service.depth.tof.shared_light import find_fog, pattern_bins, without_bins
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
@@ -85,10 +87,11 @@ MISFIT_PIXELS = 0.2
 
 
 def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
-                     far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
+                     far_m: float | None, limit: float | None, usable: np.ndarray, rays: np.ndarray | None, device: str) -> RangeImage:
     """Return the range of each pixel from photon histograms.
     `near_m, far_m`: the span of half paths; None: that of the histogram. `limit`: counts at or above it are a full counter. `usable`:
-    [rows, cols] bool mask: the others decide on nothing."""
+    [rows, cols] bool mask: the others decide on nothing. `rays`: [rows, cols, 3] unit directions of the lines of sight; None where they
+    are parallel."""
     bin_m = range_of_delay_m(frames.bin_s)
     start_m = range_of_delay_m(frames.start_s)
     end_m = start_m + bin_m * frames.counts.shape[1]
@@ -162,6 +165,13 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         warnings.append(f"frames[].tof: the pulse does not describe the returns of {100 * bent:.0f} % of the pixels, which differ from "
                         "it by more than photon noise: measure the pulse and give it in --tof-calibration; the standard deviations hold "
                         "the scatter that this makes, not a shift that all of them share, as by fog")
+    range_m = (start_m + position * bin_m).reshape(rows, cols)
+    sure = (solved & usable & (confidence >= LEAST_CONFIDENCE)).reshape(rows, cols)
+    inside_out = turned_inside_out(range_m, start_m + end_m - range_m, photons.reshape(rows, cols), sure, rays, repeat_m=start_m + end_m,
+                                   reversal=BINS)
+    if inside_out is not None:
+        confidence = confidence * DOUBTED
+        warnings.append(inside_out)
     several = (to_numpy(found.photons) > 0).sum(axis=0)
     facts: dict[str, Any] = {
         "bins": frames.counts.shape[1],
@@ -177,7 +187,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         "chosen_by_neighbours": weak,
         "background_photons_a_bin": float(np.median(to_numpy(found.background)[usable])),
     }
-    return RangeImage("time of flight, pulsed", (start_m + position * bin_m).astype(np.float32),
+    return RangeImage("time of flight, pulsed", range_m.reshape(-1).astype(np.float32),
                       (np.hypot(sigma, zero_bins) * bin_m).astype(np.float32), photons.astype(np.float32),
                       np.where(solved, confidence, 0).astype(np.float32), status, facts, LEAST_CONFIDENCE, tuple(warnings))
 

@@ -1,13 +1,15 @@
-"""Ranges of a scene that is turned inside out, told by the shape of its surfaces.
+"""Ranges of a scene that is turned inside out, told by the brightness and the shape of its surfaces.
 
-Where phases run backwards, a plane has the range of a constant less its own. Seen along diverging lines of sight that is no plane: it bends
-by the constant times the square of the angle over two, everywhere, and whatever its texture is.
+Where phases run backwards, or bins are counted from the last, a plane has the range of a constant less its own. Seen along diverging lines
+of sight that is no plane: it bends by the constant times the square of the angle over two, everywhere, and whatever its texture is.
 """
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+
+from service.depth.tof.phase_checks import misread_direction
 
 CELLS, LEAST_CELLS = 6, 18
 """Number of cells in each direction of a block in which a surface is fitted, and of those that must have ranges."""
@@ -33,18 +35,41 @@ class _Block(NamedTuple):
     """Sums over the cells of changes of the logarithm of the reversed range, times those of the brightness, and squared."""
 
 
+class Reversal(NamedTuple):
+    """How ranges come to run backwards."""
+
+    field: str
+    cause: str
+    check: str
+
+
+PHASES = Reversal("frames[].tof.reference_phase_rad", "the phases ran backwards",
+                  "check the order of the images, and the sign of reference_phase_rad")
+BINS = Reversal("frames[].image", "the last bin of the histograms were the nearest", "check the order of the bins in the file")
+
+
+def turned_inside_out(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray, rays: np.ndarray | None, *,
+                      repeat_m: float, reversal: Reversal) -> str | None:
+    """Return that ranges look reversed, as a sentence; None where they do not. The arguments are those of `misread_shape`; `rays`: None
+    where lines of sight are parallel, and the brightness alone tells it."""
+    told = misread_direction(range_m, reversed_m, amplitude, sure)
+    if told is None and rays is not None:
+        told = misread_shape(range_m, reversed_m, amplitude, sure, rays, repeat_m=repeat_m)
+    return None if told is None else f"{reversal.field}: {told}, as if {reversal.cause}: {reversal.check}; no range is believed"
+
+
 def misread_shape(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray, rays: np.ndarray, *,
                   repeat_m: float) -> str | None:
-    """Return that surfaces are plane only if the phases run backwards, as a sentence; None where they are not, or too few tell.
+    """Return that surfaces are plane only if the ranges are reversed, in words; None where they are not, or too few tell.
 
     A bowl of just the radius would pass for a reversed plane. So light must fall with the reversed range, as it does not in a bowl.
 
     Args:
-        range_m, reversed_m: [rows, cols] metres, as declared and if phases run backwards.
+        range_m, reversed_m: [rows, cols] metres, as declared and reversed.
         amplitude: [rows, cols], in any unit.
         sure: [rows, cols] bool, pixels with a range.
         rays: [rows, cols, 3] unit directions of the lines of sight.
-        repeat_m: the distance after which all phases repeat.
+        repeat_m: what a range and the reversed one add up to, but for the wraps of phases.
     """
     lit = sure & (range_m > 0) & (reversed_m > 0) & (amplitude > 0)
     layers = np.concatenate([np.stack([range_m, reversed_m, np.log(np.where(lit, amplitude, 1.0))], axis=-1), rays], axis=-1)
@@ -61,9 +86,7 @@ def misread_shape(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.nda
     falls, far = sum(block.falls for block in blocks), sum(block.far for block in blocks)
     if not STEEPEST * far < falls < FLATTEST * far:
         return None
-    return (f"frames[].tof.reference_phase_rad: {100 * other / area:.0f} % of the surfaces are plane if the phases run backwards, and "
-            f"{100 * plane / area:.0f} % as declared: check the order of the images, and the sign of reference_phase_rad; no range is "
-            "believed")
+    return f"{100 * other / area:.0f} % of the surfaces are plane if ranges are reversed, and {100 * plane / area:.0f} % as declared"
 
 
 def _blocks(layers: np.ndarray, top: int, left: int, rows: int, cols: int, blocks: int, repeat_m: float) -> Iterator[_Block]:

@@ -6,7 +6,7 @@ the distance, where light falls off with its square. Both are only looked for; a
 not.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -22,14 +22,16 @@ LARGEST_RAD = 0.7
 CLEAR_SIGMAS = 5.0
 """Least change of the phase that others are compared with, in its standard deviations: noise then hardly dilutes their ratio."""
 ENOUGH = 200
-"""Number of neighbours that tell a ratio."""
-AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.6, 2.0
+"""Number of neighbours that tell a ratio, and of pixels that tell what an image shows."""
+AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.85, 2.0
 """Share of the pixels whose frequencies agree, from which on the frequencies are not doubted; least share with which another reading is
 named, and how many times that of the declared one it must be."""
 AS_GOOD = 0.02
 """Share of the pixels by which one reading may be worse than another and still be named in its place."""
 STEP_HZ, UNSURE_RATIO = 1e6, 0.04
 """Steps of the frequencies that are tried, and the part by which changes of phases leave their ratio open: wiggling and edges bend it."""
+NARROW = 0.995
+"""Mean of the unit vectors of a phase from which on it spans too little, a third of a radian: there wiggling makes any ratio."""
 BLOCKS = 12
 """Number of blocks in each direction of an image in which the brightness is compared with the range."""
 IN_A_BLOCK = 20
@@ -41,7 +43,7 @@ STEEPEST, FLATTEST = -4.0, -1.0
 textures."""
 SURE_BLOCK, MOST_BLOCKS, LAWFUL_BLOCKS, FEWEST_BLOCKS = 0.3, 0.7, 0.6, 20
 """Least correlation of brightness and range in a block that tells a sign, share of such blocks in which surfaces grow brighter with the
-distance and share of these in which the brightness falls as light does if phases run backwards, from which on they do, and number of blocks
+distance and share of these in which the brightness falls as light does if ranges run backwards, from which on they do, and number of blocks
 that tell it. Bowls and hollows with bright paint have 0.45 of lawful blocks at most, rooms 0.74 at least."""
 UNFIT_TIMES, UNFIT_PART = 4.0, 0.2
 """Variance that the wave of a frequency leaves of its images, over that of their neighbours in a row, and its root over the amplitude, from
@@ -82,12 +84,14 @@ class Phases(NamedTuple):
         return Phases((self.phase * sign[:, None, None] % (2 * np.pi))[order], self.sigma[order], hz[order])
 
 
-def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float]) -> str | None:
+def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float],
+                        others: Iterable[tuple[Phases, str]]) -> str | None:
     """Return how frequencies are declared wrongly, as a sentence; None if none is, or no other reading fits.
-    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases."""
+    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases. `others`: further readings, each with
+    what to check."""
     if declared >= AGREE or len(phases.hz) < 2:
         return None
-    tried = [(agreeing(other), words) for other, words in _readings(phases)]
+    tried = [(agreeing(other), words) for other, words in (*_readings(phases), *others)]
     best, words = next(found for found in tried if found[0] >= max(tried)[0] - AS_GOOD)  # exchanged ones come first
     if best < max(CLEAR_SHARE, CLEAR_TIMES * declared):
         return None
@@ -106,8 +110,10 @@ def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
         swapped[[a, b]] = hz[[b, a]]
         yield phases.changed(swapped, same), f"{hz[a] / 1e6:g} and {hz[b] / 1e6:g} MHz are exchanged: check modulation_hz"
     seen: set[tuple[int, float]] = set()
+    spans = [abs(np.exp(1j * phase[sigma > 0]).mean()) < NARROW if (sigma > 0).any() else False
+             for phase, sigma in zip(phases.phase, phases.sigma, strict=True)]
     for known, other in permutations(range(len(hz)), 2):
-        ratio = _ratio(phases, other, known)
+        ratio = _ratio(phases, other, known) if spans[known] and spans[other] else None
         if ratio is None:
             continue
         least, most = (round((1 + part) * abs(ratio) * hz[known] / STEP_HZ) for part in (-UNSURE_RATIO, UNSURE_RATIO))
@@ -123,11 +129,22 @@ def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
 def _words(declared_hz: float, found_hz: float, *, backwards: bool) -> str:
     declared = f"{declared_hz / 1e6:g} MHz"
     what = [f"{declared} are {found_hz / 1e6:g} MHz: check modulation_hz"] if found_hz != declared_hz else []
-    return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad"] if backwards else what)
+    return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad and the "
+                               "order of the images"] if backwards else what)
 
 
 def _ratio(phases: Phases, one: int, other: int) -> float | None:
-    """Return how many times as fast one phase changes over surfaces as another; None if too few neighbours tell it."""
+    """Return how many times as fast one phase changes over surfaces as another; None if too few neighbours tell it. The slower is divided
+    by the faster: noise of what is divided by makes a ratio too small (120 MHz were 6.4 times 16)."""
+    over = _divided(phases, one, other)
+    if over is not None and abs(over) <= 1:
+        return over
+    under = _divided(phases, other, one)
+    return 1 / under if under else over
+
+
+def _divided(phases: Phases, one: int, other: int) -> float | None:
+    """Return the median change of one phase over surfaces in that of another; None if too few neighbours tell it."""
     first: list[np.ndarray] = []
     second: list[np.ndarray] = []
     for axis in (0, 1):
@@ -158,16 +175,16 @@ def _between(phase: np.ndarray, axis: int) -> np.ndarray:
 
 
 def misread_direction(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray) -> str | None:
-    """Return that the phases look declared backwards, as a sentence; None if light does not fall off more rightly so.
+    """Return how the brightness of surfaces tells that ranges run backwards, in words; None if light does not fall off more rightly so.
 
-    That surfaces grow brighter with the distance is not enough: the walls of a bowl do, and paint that is bright behind. If the phases run
+    That surfaces grow brighter with the distance is not enough: the walls of a bowl do, and paint that is bright behind. If the ranges run
     backwards the brightness follows the true distances, and falls with these as light does.
 
     Source: Horn, "Obtaining shape from shading information", 1975: under a source at the camera, a plane's light falls with the cube of the
     distance.
 
     Args:
-        range_m, reversed_m: [rows, cols] metres, as declared and if phases run backwards.
+        range_m, reversed_m: [rows, cols] metres, as declared and if ranges run backwards.
         amplitude: [rows, cols], in any unit.
         sure: [rows, cols] bool, pixels with a range.
     """
@@ -190,8 +207,7 @@ def misread_direction(range_m: np.ndarray, reversed_m: np.ndarray, amplitude: np
     share = float(brighter.sum() / tells.sum()) if tells.sum() >= FEWEST_BLOCKS else 0.0
     if share < MOST_BLOCKS or ((power >= STEEPEST) & (power <= FLATTEST))[brighter].mean() < LAWFUL_BLOCKS:
         return None
-    return (f"frames[].tof.reference_phase_rad: in {100 * share:.0f} % of the scene surfaces grow brighter with the distance, as if the "
-            "phases ran backwards: check the order of the images, and the sign of reference_phase_rad; no range is believed")
+    return f"in {100 * share:.0f} % of the scene surfaces grow brighter with the distance"
 
 
 def unfitting_images(images: np.ndarray, hz: np.ndarray, reference_phase_rad: np.ndarray, scale: np.ndarray,

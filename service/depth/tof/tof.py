@@ -58,7 +58,7 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         near_path_m, far_path_m = _half_path_span(path, mask, near_m, far_m)
         timings.stage("returns", 1)
         found = solve_histograms(histograms, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit,
-                                 usable=mask, device=device)
+                                 usable=mask, rays=_rays(capture.camera), device=device)
     else:
         correlations = read_correlations(capture)
         path = SourcePath.of(capture.camera, correlations.source_m)

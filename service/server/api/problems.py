@@ -18,6 +18,7 @@ from service.server.database.engine import UNANSWERED, message_of
 from service.server.database.quotas import BYTES, QuotaExceeded
 from service.server.pages import routes as pages
 from stage.errors import StorageError
+from stage.records import said
 
 MEDIA_TYPE = "application/problem+json"
 CHECKSUM_MISMATCH = 460
@@ -106,7 +107,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(fault["msg"].removeprefix("Value error, ")))
+        faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(
+                    said(fault) if fault["type"] == "string_pattern_mismatch" else fault["msg"].removeprefix("Value error, ")))
                   for fault in error.errors()[:MAX_FAULTS]]
         return answer(request, "invalid", "; ".join(f"{fault.field}: {fault.message}" for fault in faults), faults=faults)
 

@@ -145,10 +145,12 @@ LENS = 1 - 0.25 * (V**2 + U**2)
 @pytest.mark.parametrize(("light", "words"), [
     (LENS, None),
     (1 - 0.25 * (V**2 + (U - 0.1) ** 2), None),  # of a lens that stands aside of the sensor
-    (LENS * (1 + 0.2 * U), "falls by 3"),
+    ((1 + ((U - 0.1) ** 2 + (V - 0.1) ** 2) / 1.44) ** -2, None),  # cos⁴ of a wide lens, 5 % of the width and height aside
+    (LENS * (1 + 0.2 * U), "falls by"),  # by 33 %, of which a quadratic lens aside may make a part
+    ((1 + (U**2 + V**2) / 1.44) ** -2 * (1 + 0.2 * U), "falls by"),
     (LENS * np.where(U > 0.3, 0.6, 1), "uneven by"),
     (LENS * (1 + 0.1 * np.sin(12 * U) * np.sin(9 * V)), "uneven by"),
-], ids=["a lens", "aside", "a lamp from the side", "a shadow", "an object"])
+], ids=["a lens", "aside", "a wide lens aside", "a lamp from the side", "and a wide lens", "a shadow", "an object"])
 def test_a_card_that_is_not_evenly_lit_is_said(light, words):
     card = light[..., None] * (0.8, 0.7, 0.6) * (1 + RNG.normal(0, 0.02, (60, 80, 3)))
     faults = card_faults(card, V**2 + U**2 < 1.2)

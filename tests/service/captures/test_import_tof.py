@@ -34,6 +34,7 @@ def error(maps, truth=RANGE_M):
     return np.abs(maps.range - truth)[maps.mask]
 
 
+SWEPT = 600 + correlations([60e6], [0, 90, 180, 270])
 QUARTERS = ("--phases-deg", "0,90,180,270")
 
 
@@ -88,6 +89,8 @@ def test_two_frequencies_with_the_other_sign(relit, tmp_path, order):
     (b"x" * 99, (), "dcs.bin: is raw numbers: give their --dtype"),
     (b"x" * 99, ("--dtype", "uint16", "--size", "4x4"), "bytes, which is no whole number of images of 4x4 uint16 (32"),
     (b"x" * 32, ("--dtype", "words", "--size", "4x4"), "--dtype words: is no type of numbers"),
+    *((SWEPT.astype(kind).tobytes(), ("--dtype", told, "--size", f"{COLS}x{ROWS}"), f"give --dtype '{kind}'")
+      for kind, told in ((">i2", "int16"), ("<u4", ">u4"), (">f4", "float32"))),
 ])
 def test_faults_of_correlation_images(relit, tmp_path, values, words, message):
     if isinstance(values, bytes):
@@ -239,3 +242,16 @@ def test_a_damaged_archive_is_named(relit, tmp_path, cut):
     (tmp_path / "h.npz").write_bytes((tmp_path / "h.npz").read_bytes()[:cut])
     relit("import", "histogram", tmp_path, "--bin-s", "1e-10").refused("h.npz: is no whole .npz file of numbers")
     relit("import", "histogram", tmp_path / "none.npz", "--bin-s", "1e-10").refused("none.npz")
+
+
+@pytest.mark.parametrize(("told", "right"), [(">u2", False), ("<u2", True)])
+def test_counts_in_the_other_order_of_bytes_are_named(relit, tmp_path, told, right):
+    """Few counts are above 255, so that in the other order nearly all are multiples of 256 and neighbours differ as much as in the right
+    one."""
+    counts = RNG.poisson(20 + 900 * (np.arange(16)[:, None, None] == 5) * RNG.random((ROWS, COLS))).astype("<u2")
+    (tmp_path / "h.bin").write_bytes(counts.tobytes())
+    ran = relit("import", "histogram", tmp_path, "--bin-s", "1e-9", "--bins", "first", "--dtype", told, "--size", f"{COLS}x{ROWS}")
+    if right:
+        ran.well()
+    else:
+        ran.refused("give --dtype '<u2'")

@@ -39,6 +39,16 @@ def test_a_white_sphere_of_light_lights_every_lamp_by_its_cell(drive, tmp_path):
     assert report["exposure"] == 1
 
 
+@first_short("exposure", [-13.0, 0.0])
+def test_light_below_the_steps_of_the_lamps_is_said(drive, tmp_path, exposure):
+    """All lamps together want less than half a step of eight bits: every one is dark."""
+    write_rig(tmp_path / "rig.json", fibonacci_sphere(32), bits=8)
+    write_exr(tmp_path / "sky.exr", np.ones((16, 32, 3), dtype=np.float32))
+    (levels,), report = drive("--environment", tmp_path / "sky.exr", "--exposure", exposure)
+    assert any(levels.values()) == (exposure == 0)
+    assert any("the steps of the lamps" in said for said in report["warnings"]) == (exposure < 0)
+
+
 def test_a_sun_at_a_lamp_lights_that_lamp_alone(drive, tmp_path):
     directions = fibonacci_sphere(128)
     write_rig(tmp_path / "rig.json", directions, irradiance=4.0, bits=16)

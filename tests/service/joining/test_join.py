@@ -88,6 +88,16 @@ def test_an_asset_is_made_of_it(relit, tmp_path):
     assert np.ptp(points[:, 2]) == pytest.approx(np.ptp(z[3:]), rel=0.1)
 
 
+@pytest.mark.long
+def test_steps_of_a_rounded_depth_are_said(relit, tmp_path):
+    solved, depth, *_ = write(tmp_path)
+    given = DepthMaps.read(depth / "depth.exr")
+    replace(given, depth=(np.round(given.depth / (5 * SIGMA)) * 5 * SIGMA).astype(np.float32)).write(depth / "depth.exr")
+    relit.done("join", solved, depth, "--out", tmp_path / "joined")
+    report = json.loads((tmp_path / "joined" / "report.json").read_text())
+    assert any(each.startswith("depth: its values lie in steps of 0.002 m") for each in report["warnings"])
+
+
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"mirrored": True}, "of the relief in .* unexplained: they are not of one"),
     ({"depth_camera": {"focal_px": (510.0, 510.0)}}, r"depth\.exr: focal_px of its camera is not that of"),

@@ -4,9 +4,10 @@ noise are those of tests/reference/tof.py."""
 import numpy as np
 import pytest
 
+from tests.marks import first_short
 from tests.reference import tof
 from tests.scenes.depth import depth_of
-from tests.scenes.tof import cw_frames, write
+from tests.scenes.tof import cw_frames, pulsed_frames, write
 
 ROWS, COLS = 72, 96
 VIEW = tof.room(ROWS, COLS)
@@ -66,12 +67,33 @@ def backwards(hz, delta):
     (HZ, 4, lambda hz, delta: backwards(hz, delta) if hz == 50e6 else (hz, delta), "the phases of 50 MHz run backwards"),
     (HZ, 4, lambda hz, delta: (hz, (delta - np.pi / 2) % (2 * np.pi)), "reference_phase_rad is a quarter of a turn more"),
     (HZ, 4, lambda hz, delta: ({50e6: 52e6}.get(hz, hz), delta), "52 MHz are 50 MHz"),
-    *(pytest.param(HZ, 4, lambda hz, delta, told=told: (told.get(hz, hz), delta), words, marks=pytest.mark.long) for told, words in (
-        ({60e6: 57e6}, "57 MHz are 60 MHz"), ({20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"))),
-], ids=["backwards", "three phases", "two frequencies", "one", "one of three", "a quarter aside", "52 MHz", "57 MHz", "exchanged"])
+    *(pytest.param(of, 4, lambda hz, delta, told=told: (told.get(hz, hz), delta), words, marks=pytest.mark.long) for of, told, words in (
+        (HZ, {60e6: 57e6}, "57 MHz are 60 MHz"), (HZ, {20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"),
+        ((16e6, 120e6), {120e6: 126e6}, "126 MHz are 120 MHz"))),  # 95 % of the ranges were 9 m off
+], ids=["backwards", "three phases", "two frequencies", "one", "one of three", "a quarter aside", "52 MHz", "57 MHz", "exchanged",
+        "126 MHz"])
 def test_a_wrong_declaration_is_named(tmp_path, hz, phases, declared, words):
     images, settings = under(hz, phases)
     result = measured(tmp_path, images, [declared(*setting) for setting in settings])
+    assert not result.maps.mask.any() and words in result.warnings[0]
+
+
+def without(images, lost, of=None):
+    images = images.copy()
+    images[lost] = 3.0 if of is None else images[of] if isinstance(of, int) else of * images[lost]
+    return images
+
+
+@first_short(("hz", "fault", "words"), [
+    (HZ, lambda images: without(images, 4, 0.8), "50 MHz at 120° is 0.8 times"),
+    (HZ, lambda images: images[[1, 0, *range(2, 9)]], "order 2, 1, 3"),
+    ((60e6,), lambda images: without(images, 1, 0), "shows what that at 0° shows"),
+    ((60e6,), lambda images: without(images, 2), "60 MHz at 240° has one reading"),
+], ids=["darker", "exchanged", "shown twice", "blank"])
+def test_an_image_of_three_is_named(tmp_path, hz, fault, words):
+    """Three images fit any wave: they were wiggling or fog, and under one frequency believed without a word."""
+    images, settings = under(hz, 3)
+    result = measured(tmp_path, fault(images), settings)
     assert not result.maps.mask.any() and words in result.warnings[0]
 
 
@@ -84,7 +106,17 @@ def test_planes_with_texture_tell_that_phases_run_backwards(tmp_path, hz):
     assert not right.warnings and right.maps.mask.mean() > 0.95
     result = measured(tmp_path / "backwards", images, [backwards(*setting) for setting in settings])
     assert not result.maps.mask.any()
-    assert "plane if the phases run backwards" in result.warnings[0]
+    assert "plane if ranges are reversed" in result.warnings[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("reverse", [True, False], ids=["last bin first", "right"])
+def test_histograms_whose_last_bin_comes_first_are_named(tmp_path, reverse):
+    counts = tof.histogram(textured(curved=False), 20000, bins=48, bin_s=4e-10, sigma_s=5e-10, seed=3)
+    write(tmp_path, pulsed_frames(counts[..., ::-1] if reverse else counts, bin_s=4e-10),
+          camera={"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]})
+    result = depth_of(tmp_path)
+    assert any("check the order of the bins" in said for said in result.warnings) == reverse and (result.maps.mask.mean() > 0.95) != reverse
 
 
 @pytest.mark.parametrize("hz", [HZ, (12e6,)], ids=["three", "one"])
