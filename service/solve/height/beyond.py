@@ -14,8 +14,8 @@ from service.solve.height.height import projection_of
 from service.solve.height.interreflection import Patches
 from stage.capture.camera import Camera
 
-ENDS, MIRRORED, TURNED = 0, 1, 2
-"""Numbers of the ways in which a surface goes on beyond a border."""
+MIRRORED, TURNED = 1, 2
+"""Numbers of the ways in which a surface goes on beyond a border; 0: it ends there."""
 LIKELY = np.array([0.4, 0.1, 0.5])
 """Likelihood of each of these before the readings are asked. Near a border slopes are kept, and mirror images bend what is round."""
 COST_TEMPERATURE = 0.05

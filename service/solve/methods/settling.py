@@ -22,7 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
-from service.solve.height.beyond import ENDS, by_cost, light_from_beyond
+from service.solve.height.beyond import by_cost, light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.height import projection_of
 from service.solve.height.interreflection import patches_of
@@ -220,8 +220,8 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         light = light._replace(arriving=None if patches is None else patches.arriving(light.height, projection_of(camera)), albedo=dimmed)
         beyond = None if patches is None else light_from_beyond(patches, camera, directions, light.height, solved)
         if beyond is not None:
-            beyond -= np.tensordot(shown_beyond(light, beyond), beyond, 1)
-            light = light.with_more(-beyond[ENDS])
+            taken = np.tensordot(shown_beyond(light, beyond), beyond, 1)
+            light, beyond = light.with_more(taken), beyond - taken
         cost = _cost_of(light, middles, turned, shape, pick)
     settled, fit = with_strength(light, cost)
     unknown = UNKNOWN_STRENGTH if fit is None else math.hypot(RELATIVE_NOISE, fit.sigma / fit.scale, settled.albedo_scale / fit.scale - 1)
