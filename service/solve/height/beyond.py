@@ -23,9 +23,11 @@ COST_TEMPERATURE = 0.05
 parts that are cut from folds cost .02 to .1 less with that of the way that is next to the truth."""
 
 
-def by_cost(costs: np.ndarray) -> np.ndarray:
-    """Return the likelihood of each way, [3], by the cost of readings with its light."""
-    likely = LIKELY * np.exp((costs.min() - costs) / max(COST_TEMPERATURE * float(costs.min()), 1e-12))
+def likelihoods(costs: np.ndarray, lacking: np.ndarray) -> np.ndarray:
+    """Return the likelihood of each way, [3], by the cost of readings with its light, and by the standard errors that shadows lack of that
+    light: gloss and what is out of sight add to the light of form factors, and nothing takes from it."""
+    dearer = (costs - costs.min()) / max(COST_TEMPERATURE * float(costs.min()), 1e-12)
+    likely = LIKELY * np.exp(-dearer - (lacking**2 - lacking.min()**2) / 2)
     return likely / likely.sum()
 
 

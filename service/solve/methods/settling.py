@@ -22,7 +22,7 @@ from kernels.photometric.model.samples import Samples, evenly, readings_of
 from kernels.photometric.search.descent import Descent, descend
 from kernels.photometric.search.hypotheses import LobeShape
 from service.light_estimation.lambertian import degrees_between
-from service.solve.height.beyond import by_cost, light_from_beyond
+from service.solve.height.beyond import light_from_beyond, likelihoods
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.height import projection_of
 from service.solve.height.interreflection import patches_of
@@ -202,12 +202,15 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         return light._replace(albedo_scale=fit.scale if lit is None else max(fit.scale, (fit.scale + lit) / 2)), fit
 
     def shown_beyond(light: DirectLight, ways: np.ndarray) -> np.ndarray:
-        """Return the likelihood of each of `ways` to go on beyond the image, by what lit readings cost with its light."""
-        costs = []
-        for each in (light.with_more(way) for way in ways):
-            cost = _cost_of(each, middles, turned, shape, pick)
-            costs.append(cost(with_strength(each, cost)[0].albedo_scale))
-        return by_cost(np.array(costs))
+        """Return the likelihood of each of `ways` to go on beyond the image, by what readings say with its light."""
+        costs, lacking = np.zeros(len(ways)), np.zeros(len(ways))
+        for number, way in enumerate(ways):
+            cost = _cost_of(light.with_more(way), middles, turned, shape, pick)
+            found, fit = with_strength(light.with_more(way), cost)
+            costs[number] = cost(found.albedo_scale)
+            if fit is not None and not relative:
+                lacking[number] = max(1 - fit.scale, 0) / fit.sigma
+        return likelihoods(costs, lacking)
 
     for _ in range(ROUNDS):
         light, _ = with_strength(light, cost)

@@ -9,7 +9,7 @@ import warp as wp
 
 from kernels.photometric.lambertian.readings import pad_lights
 from service.requests.solve import Method, SolveRequest
-from service.solve.height.beyond import MIRRORED, TURNED, light_from_beyond
+from service.solve.height.beyond import LIKELY, MIRRORED, TURNED, light_from_beyond, likelihoods
 from service.solve.height.interreflection import arriving_light, patches_of
 from service.solve.solve import solve
 from stage.capture.camera import Camera
@@ -68,6 +68,16 @@ def test_what_arrives_from_a_wall_that_goes_on_as_it_does_in_the_image():
     own = arriving_light(*half)
     wanted = whole.light[whole.numbers[:, SIDE // 2:][own.numbers >= 0]] - own.light
     assert wanted.max() > 0.01 and beyond_of(*half)[TURNED] == pytest.approx(wanted, rel=5e-3, abs=5e-3 * float(wanted.max()))
+
+
+def test_readings_and_shadows_tell_how_a_surface_goes_on():
+    """In closed form: a way that costs a twentieth more is less likely by a factor of e, one whose light shadows lack by 3 standard errors
+    more than by that of another by one of exp(4)."""
+    alike = np.ones(3)
+    assert likelihoods(alike, 0 * alike) == pytest.approx(LIKELY)
+    assert likelihoods(np.array([1.05, 1.05, 1.0]), alike)[2] / LIKELY[2] == pytest.approx(np.e / (np.e * LIKELY[2] + 1 - LIKELY[2]))
+    told = likelihoods(alike, np.array([1.0, 3.0, 3.0]))
+    assert told[0] / told[1] == pytest.approx(np.exp(4) * LIKELY[0] / LIKELY[1])
 
 
 @pytest.mark.long
