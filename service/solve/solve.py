@@ -201,7 +201,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
 
 
 def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera) -> None:
-    """Raise σ to what the surface shows of errors, which the fit says as well but not of those that neighbours share."""
+    """Raise σ to what the surface shows of errors: of noise the fit says as much, of errors that neighbours share less."""
     assert solution.shared_misfit is not None and solution.height is not None
     shape, found = estimated.shape, _part_numbers(solution)
     part = np.where(estimated, 1 if found is None else found, 0)

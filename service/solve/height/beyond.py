@@ -2,7 +2,7 @@
 
 A surface that goes on beyond the border of the image throws light on what the image shows, and nothing says how much. It may end there; it
 may go on as its mirror image at the border, whose slopes are the opposite ones; or as itself turned by half a turn about the border, whose
-slopes are the same. A valley that the border cuts is lit by the first of these, a wall that rises towards the border by the second.
+slopes are the same. A mirror image lights a valley that the border cuts, and a surface that keeps its slopes a wall across from it.
 """
 
 from typing import NamedTuple
