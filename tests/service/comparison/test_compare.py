@@ -12,7 +12,6 @@ from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.errors import ManifestError, ResultError, ScanError
-from tests.marks import first_short
 from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_mesh, write_scan, write_stl
 
 REGIONS = [{"name": "top", "facing": [0, 0, 1], "tolerance": [-0.08, 0.08]},
@@ -27,12 +26,6 @@ def below(points, normals):
 
 def dent(points, normals, depth=0.15, radius=4.0):
     return np.where((np.hypot(points[:, 0] + 10, points[:, 1] - 15) < radius) & (normals[:, 2] > 0.9), -depth, 0)
-
-
-@pytest.fixture(scope="module")
-def part(tmp_path_factory) -> tuple[Part, object]:
-    made = machined_part()
-    return made, write_stl(tmp_path_factory.mktemp("design") / "part.stl", made)
 
 
 def regions(folder, entries=REGIONS):
@@ -346,17 +339,3 @@ def test_sigma_is_estimated_on_a_map_as_near_the_origin(tmp_path):
         found.append(float(read_scanned(path, 1.0, None).sigma[0]))
     assert found[0] == pytest.approx(1e-3, rel=0.1)  # the scatter of 1600 points around local planes
     assert found[1] == pytest.approx(found[0], rel=0.05)  # nanometres move points on the borders of cells, by which planes are fitted
-
-
-@first_short("fault", ["no normals", "far away"])
-def test_points_without_normals_and_far_ones_are_no_fault(tmp_path, part, fault):
-    """Of a scan with normals of 0 at a fifth of its points nothing passed, as if another thing stood there; five points at 10³⁰ m left
-    other poses open."""
-    made, design = part
-    random = np.random.default_rng(0)
-    scan = scan_of(made, random, 15_000, any_pose(random))
-    values = (scan.normals if fault == "no normals" else scan.points).copy()
-    values[:3000 if fault == "no normals" else 5] = 0 if fault == "no normals" else 1e30
-    scan = scan._replace(normals=values) if fault == "no normals" else scan._replace(points=values)
-    result = compare(request(tmp_path, write_scan(tmp_path / "scan.ply", scan), design, tolerance_m=(-1e-4, 1e-4)))
-    assert result.passed and result.warnings == ()

@@ -10,13 +10,7 @@ from service.comparison.compare import compare
 from service.errors import RequestError
 from service.requests.register import Alignment, CompareRequest
 from stage.errors import ScanError
-from tests.scenes.machined_part import SIGMA_M, Part, Scanned, any_pose, machined_part, scan_of, write_scan, write_stl
-
-
-@pytest.fixture(scope="module")
-def part(tmp_path_factory) -> tuple[Part, object]:
-    made = machined_part()
-    return made, write_stl(tmp_path_factory.mktemp("design") / "part.stl", made)
+from tests.scenes.machined_part import SIGMA_M, Part, Scanned, any_pose, scan_of, write_scan, write_stl
 
 
 def request(folder, scan, design, **given) -> CompareRequest:

@@ -8,7 +8,7 @@ pytestmark = pytest.mark.long
 
 
 def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_page, solved):
-    """It is being checked at first. What asks for a job rests while such a job is under way."""
+    """The capture is being checked at first. A button that asks for a job rests while such a job is under way."""
     page, states, submitted = small_page, ["checking", "ready"], []
 
     def unprepared(route):
