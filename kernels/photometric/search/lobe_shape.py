@@ -10,6 +10,7 @@ Source: the diffuse lobe is Burley's, "Physically-based shading at Disney", 2012
 
 import itertools
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,11 @@ pixels have in common: real objects, of lobes that none of the shapes has, share
 is noise, which the pixels average, and their shape is known better than costs of a single pixel say."""
 
 
+ROUNDED, INTERPOLATED = 1 / math.sqrt(12), 0.086
+"""Standard errors, in steps of the second search, of a shape that was tried, and of one between them: the least of a parabola through costs
+that rise as a wedge is up to .086 steps off; of objects that were rendered under slopes between steps, .01 to .14."""
+
+
 class ShapeSpread(NamedTuple):
     """How far the shapes that cost little are apart."""
 
@@ -52,11 +58,13 @@ class ShapeSpread(NamedTuple):
     """Standard deviation of the roughness of their diffuse lobes."""
     slope: float
     """That of the slope of the further factor."""
+    rounding: float = ROUNDED
+    """Standard error because shapes are tried in steps, of these."""
 
     def errors(self, shared: float) -> tuple[float, float]:
         """Return the standard errors of roughness and slope of their mean. `shared`: 0…1, of `shared_misfit`."""
         part = math.sqrt(min(1.0, SHAPE_SHARE * shared))
-        return math.hypot(part * self.rough, ROUGH_STEP / math.sqrt(12)), math.hypot(part * self.slope, SLOPE_STEP / math.sqrt(12))
+        return math.hypot(part * self.rough, self.rounding * ROUGH_STEP), math.hypot(part * self.slope, self.rounding * SLOPE_STEP)
 
 
 UNKNOWN_SPREAD = ShapeSpread(0.1, 0.05)
@@ -119,7 +127,7 @@ def _best(tried: dict[LobeShape, float]) -> LobeShape:
 
 def _average(tried: dict[LobeShape, float], best: LobeShape) -> tuple[LobeShape, ShapeSpread]:
     """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs, and their spread
-    about it."""
+    about it. The slope of Lambert's lobe is found between those tried where they spread by less than a step."""
     alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items()
                       if (shape.rough < 0, shape.short_tails) == (best.rough < 0, best.short_tails)])
     least = alike[:, 2].min()
@@ -127,5 +135,15 @@ def _average(tried: dict[LobeShape, float], best: LobeShape) -> tuple[LobeShape,
     weights /= weights.sum()
     mean = weights @ alike[:, :2]
     rough, slope = np.sqrt(weights @ (alike[:, :2] - mean) ** 2)
-    return (LobeShape(rough=round(float(mean[0]), 4), slope=round(float(mean[1]), 4), short_tails=best.short_tails),
-            ShapeSpread(float(rough), float(slope)))
+    between = _slope_between(tried, best) if best.rough < 0 and slope < SLOPE_STEP else None
+    shape = replace(best, rough=round(float(mean[0]), 4), slope=round(float(mean[1] if between is None else between), 4))
+    return shape, ShapeSpread(float(rough), float(slope), ROUNDED if between is None else INTERPOLATED)
+
+
+def _slope_between(tried: dict[LobeShape, float], best: LobeShape) -> float | None:
+    """Return the slope where a parabola through the costs of the best shape and of those a step beside it is least; None: they were not
+    tried, or cost the same."""
+    below, above = (tried.get(replace(best, slope=round(best.slope + step, 4))) for step in (-SLOPE_STEP, SLOPE_STEP))
+    if below is None or above is None or not (bend := below + above - 2 * tried[best]) > 0:
+        return None
+    return best.slope + SLOPE_STEP * (below - above) / (2 * bend)
