@@ -12,10 +12,11 @@ from service.reporting.progress import Timings
 from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
 from service.sharing.sharing import SharedSolve
 from service.solve.albedo_scale import check_request, moderate
-from service.solve.base.solution import SolveInput
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.distance import Distance, find_distance
 from service.solve.lights.intensities import LightsOverTime, choose_intensities
-from service.solve.methods.methods import METHODS, Solver
+from service.solve.lights.other_lights import OtherLights, Rig, find_other_lights
+from service.solve.methods.methods import METHODS, Solver, solve_in_rig
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_surface, distant_lights
 from stage.capture.manifest import FILE_NAME
@@ -53,6 +54,14 @@ class Opened(NamedTuple):
     """The factor by which the lights of the solve are brighter than those of the manifest, whose common factor is not known."""
     distance: Distance | None = None
     """The way in which the distance of the surface was found, where the manifest does not say it."""
+    other: OtherLights | None = None
+    """Lights that explain the images much better than distant ones of the manifest."""
+    rig: Rig | None = None
+    """Where the solve takes distant lights to be; None: at infinity."""
+
+    def solve(self) -> Solution:
+        """Solve the capture."""
+        return self.solver(self.given, self.lights) if self.rig is None else solve_in_rig(self.given, self.rig.lights, self.method)
 
 
 def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
@@ -117,7 +126,10 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     if isinstance(lights, DistantLights) and given.refine_intensities:
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
-    return Opened(capture, method, used, lights, solver, given, facts, brighter=brighter, distance=distance)
+    other = find_other_lights(given, used) if isinstance(used, DistantLights) else None
+    rig = other.rig if other is not None and over_time is None and pairs is None else None  # steps would find rigs of their own
+    return Opened(capture, method, used, lights, solver, given, facts if rig is None else facts | rig.facts(), brighter=brighter,
+                  distance=distance, other=other, rig=rig)
 
 
 def _without_dark_frames(capture: Capture, stack: Stack, lights: Lights, mask: np.ndarray) -> tuple[Capture, Stack, Lights]:

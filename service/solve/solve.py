@@ -72,7 +72,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
         StorageError: the results cannot be written; nothing is left half-written.
     """
     opened = open_solve(request, capture, Timings(progress), sharing, over_time)
-    judged = _judge(request, opened, opened.solver(opened.given, opened.lights))
+    judged = _judge(request, opened, opened.solve())
     scale = scale_albedo(judged.solution, request, opened.brighter, over_time) if opened.given.relative else 1.0
     return _write(request, opened, judged, scale)
 
@@ -82,7 +82,7 @@ def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, 
     `request`: that of the other process, on a device of the same kind. `progress`: told how far the solve is; it ends the help by an
     exception. Raises DivergedError: this process finds something else than the other."""
     opened = open_solve(request, None, Timings(progress), sharing, over_time)
-    opened.solver(opened.given, opened.lights)
+    opened.solve()
 
 
 class _Judged(NamedTuple):
@@ -118,8 +118,8 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         _say_of_pairs(given, opened.method, solution)
     given.timings.stage("diagnosis", 1)
     said = len(solution.warnings)
-    diagnose(given, opened.capture, opened.lights, opened.declared, solution)
-    if isinstance(opened.lights, DistantLights):
+    diagnose(given, opened.capture, opened.lights, opened.declared, solution, opened.other, opened.rig)
+    if isinstance(opened.lights, DistantLights) and opened.rig is None:
         # highlights bend what least squares makes of texture, and lights that are wrong move everything
         moved = opened.method is not Method.LAMBERT and len(solution.warnings) == said
         for found in _spoilt(given, opened.lights, solution, moved):

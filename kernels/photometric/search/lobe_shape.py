@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.search.descent import Schedule, descend
@@ -46,9 +47,10 @@ pixels have in common: real objects, of lobes that none of the shapes has, share
 is noise, which the pixels average, and their shape is known better than costs of a single pixel say."""
 
 
-ROUNDED, INTERPOLATED = 1 / math.sqrt(12), 0.086
-"""Standard errors, in steps of the second search, of a shape that was tried, and of one between them: the least of a parabola through costs
-that rise as a wedge is up to .086 steps off; of objects that were rendered under slopes between steps, .01 to .14."""
+ROUNDED = 1 / math.sqrt(12)
+"""Standard error, in steps of the second search, of a shape on its grid."""
+NARROW = 0.1
+"""Tolerance, in such steps, of the slope of Lambert's lobe where costs tell it: half a step turns the normals of a clean object by 0.2°."""
 
 
 class ShapeSpread(NamedTuple):
@@ -115,7 +117,13 @@ def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape 
         rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * ROUGH_STEP, 0, 1))
         judge(rough, best.slope + along * SLOPE_STEP)
     best = _best(tried)
-    return Shapes(best, *_average(tried, best), tried)
+    mean, spread = _average(tried, best)
+    if best.rough < 0 and spread.slope < SLOPE_STEP:
+        found = minimize_scalar(lambda slope: cost_of(replace(best, slope=slope)), method="bounded", options={"xatol": NARROW * SLOPE_STEP},
+                                bounds=(best.slope - SLOPE_STEP, best.slope + SLOPE_STEP))
+        mean = replace(best, slope=round(float(found.x), 4)) if found.fun < tried[best] else best
+        spread = spread._replace(rounding=NARROW)
+    return Shapes(best, mean, spread, tried)
 
 
 def _best(tried: dict[LobeShape, float]) -> LobeShape:
@@ -127,7 +135,7 @@ def _best(tried: dict[LobeShape, float]) -> LobeShape:
 
 def _average(tried: dict[LobeShape, float], best: LobeShape) -> tuple[LobeShape, ShapeSpread]:
     """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs, and their spread
-    about it. The slope of Lambert's lobe is found between those tried where they spread by less than a step."""
+    about it."""
     alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items()
                       if (shape.rough < 0, shape.short_tails) == (best.rough < 0, best.short_tails)])
     least = alike[:, 2].min()
@@ -135,15 +143,5 @@ def _average(tried: dict[LobeShape, float], best: LobeShape) -> tuple[LobeShape,
     weights /= weights.sum()
     mean = weights @ alike[:, :2]
     rough, slope = np.sqrt(weights @ (alike[:, :2] - mean) ** 2)
-    between = _slope_between(tried, best) if best.rough < 0 and slope < SLOPE_STEP else None
-    shape = replace(best, rough=round(float(mean[0]), 4), slope=round(float(mean[1] if between is None else between), 4))
-    return shape, ShapeSpread(float(rough), float(slope), ROUNDED if between is None else INTERPOLATED)
-
-
-def _slope_between(tried: dict[LobeShape, float], best: LobeShape) -> float | None:
-    """Return the slope where a parabola through the costs of the best shape and of those a step beside it is least; None: they were not
-    tried, or cost the same."""
-    below, above = (tried.get(replace(best, slope=round(best.slope + step, 4))) for step in (-SLOPE_STEP, SLOPE_STEP))
-    if below is None or above is None or not (bend := below + above - 2 * tried[best]) > 0:
-        return None
-    return best.slope + SLOPE_STEP * (below - above) / (2 * bend)
+    return LobeShape(rough=round(float(mean[0]), 4), slope=round(float(mean[1]), 4), short_tails=best.short_tails), ShapeSpread(
+        float(rough), float(slope))

@@ -59,9 +59,10 @@ Normals of 21 path-traced folds are 2.14° off in the mean so, 2.20° with half 
 
 
 def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
-                   options: MaterialOptions = WHOLE_SOLVER) -> Solution:
-    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness."""
-    walk = _Walk(given, lights, field, options)
+                   options: MaterialOptions = WHOLE_SOLVER, once: bool = False) -> Solution:
+    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness. `once`: no rounds under near lights follow, so that lobes
+    and intensities are found as under distant ones."""
+    walk = _Walk(given, lights, field, options, once=once)
     walk.start()
     walk.choose_shape()
     walk.search()
@@ -73,7 +74,7 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
 def refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
     """Solve again from a solution of `solve_material`, or of this function: shadows and interreflection follow from its surface, and no
     first search is needed."""
-    walk = _Walk(given, lights, field, WHOLE_SOLVER)
+    walk = _Walk(given, lights, field, WHOLE_SOLVER, once=False)
     walk.start()
     walk.resume(before)
     light = walk.direct_light()
@@ -85,7 +86,8 @@ def refine_material(given: SolveInput, lights: Lights, field: NearField, before:
 class _Walk:
     """The state of a solve between its passes over the image."""
 
-    def __init__(self, given: SolveInput, lights: Lights, field: NearField | None, options: MaterialOptions) -> None:
+    def __init__(self, given: SolveInput, lights: Lights, field: NearField | None, options: MaterialOptions, *, once: bool) -> None:
+        self._once = once or field is None
         self._given, self._lights, self._field, self._options = given, lights, field, options
         self._view = view_directions(given.camera)
         self._interreflection = options.interreflection
@@ -98,6 +100,7 @@ class _Walk:
         self._unknown_bounce: np.ndarray | float = 0.0  # degrees, [pixels], by which an unknown strength of that light turns normals
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
         self._shape, self._lobe, self._shape_spread = LobeShape(), LobeShape(), UNKNOWN_SPREAD
+        self._resumed = False
         self._supported, self._pull, self._simpler = True, 0.0, Method.LAMBERT
 
     def start(self) -> None:
@@ -128,6 +131,7 @@ class _Walk:
         self.result.normal[:, solved], self.result.albedo[:, solved] = before.normal[:, solved], before.albedo[:, solved]
         self._roughness[solved] = before.roughness[solved]
         self._bouncing[:, solved] = before.albedo[:, solved]
+        self._resumed = True
 
     def choose_shape(self, light: DirectLight | None = None) -> None:
         """Choose the shape of the lobes, and find out whether few lights support the lobes at all."""
@@ -179,10 +183,10 @@ class _Walk:
                              parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or not self._options.settling:
             return light
-        if self._supported and self._field is None:
+        if self._supported and self._once:
             self._shape_of(self._clear(light.arriving), light, self._shape.short_tails)
         relative = self._given.relative and self._options.scale
-        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
+        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative, direct=self._resumed)
         self._unknown_bounce = settled.degrees
         self.result.facts |= settled.report(relative=relative)
         self.result.warnings += settled.warnings()
@@ -196,7 +200,7 @@ class _Walk:
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:
         """Replace the intensities of the lights where the object shows that others explain it better; returns the direct light of them."""
-        told = (self._supported and not self._few and self._field is None and self._options.intensities
+        told = (self._supported and not self._few and self._once and self._options.intensities
                 and self._given.refine_intensities)
         if light is None or not told:
             return light

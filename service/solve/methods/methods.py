@@ -11,7 +11,7 @@ from kernels.photometric.lambertian.robust import solve_robust
 from service.requests.solve import SVBRDF_LIGHTS, Method
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.diffuse import solve_diffuse
-from service.solve.methods.near import MATERIAL_ROUNDS, NormalSolver, Rounds, solve_near
+from service.solve.methods.near import MATERIAL_ROUNDS, NormalSolver, Rounds, solve_near, solve_once
 from service.solve.methods.reference_ball import ReferenceBall, reference_ball
 from stage.capture.capture import Capture
 from stage.capture.gradients import GradientFrames, gradient_frames, has_gradients
@@ -59,6 +59,12 @@ def _solve_material(given: SolveInput, lights: Lights, field: NearField | None =
     from service.solve.methods.material import solve_material
 
     return _with_highlights(given, lights, field, solve_material)
+
+
+def _solve_material_in_rig(given: SolveInput, lights: PlacedLights) -> Solution:
+    from service.solve.methods.material import solve_material
+
+    return solve_once(given, lights, ROBUST, partial(solve_material, once=True))
 
 
 def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
@@ -116,3 +122,8 @@ METHODS: Mapping[Method, MethodEntry] = {
     Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: _solve_by_reference}, IN_NOISE),
 }
 """Every method. The default for a capture is the first whose `is_default` says so."""
+
+
+def solve_in_rig(given: SolveInput, lights: PlacedLights, method: Method) -> Solution:
+    """Solve under lights so far from the object that svbrdf needs no rounds: the surface of `robust` says where its points are."""
+    return _solve_material_in_rig(given, lights) if method is Method.SVBRDF else METHODS[method].solvers[PlacedLights](given, lights)

@@ -94,3 +94,19 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     solution.facts = {**solution.facts, "near": {"rounds": rounds, "last_change_of_relief": round(change, 6), "settled": settled}}
     solution.height, solution.integration = np.where(solved, height, 0).astype(np.float32), integration
     return solution
+
+
+def solve_once(given: SolveInput, lights: PlacedLights, first: Rounds, solver: NormalSolver) -> Solution:
+    """Solve every pixel of the mask under lights that are near, once, on the surface on which the `first` rounds have settled."""
+    before = solve_near(given, lights, series=(first,))
+    solved, mean_z = (before.status == Status.OK).reshape(given.mask.shape), mean_height(given.camera)
+    height = np.full(given.mask.shape, mean_z, np.float32) if before.height is None else whole_surface(
+        before.height, solved, given.mask, mean_z=mean_z, perspective=given.camera.projection == "perspective")
+    points = np.moveaxis(given.camera.points(height), -1, 0).reshape(3, -1)
+    solution = solver(given, pad_lights(lights.direction, lights.strength, given.stack.scale),
+                      NearField(pad_places(lights.place, lights.lobe), points))
+    mark_not_facing(given.camera, solution)
+    solved = (solution.status == Status.OK).reshape(given.mask.shape)
+    solution.integration = integrate(given, solution.normal, solved, sigma=solution.standard_error())
+    solution.height = None if solution.integration is None else to_numpy(solution.integration.height)
+    return solution

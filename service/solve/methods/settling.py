@@ -126,19 +126,19 @@ def _middles_of(light: DirectLight, pick: Callable[[np.ndarray], Samples]) -> Mi
     return Middles(solved, block, pixels, readings_of(pick(pixels)))
 
 
-def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
+def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], *, relative: bool,
+           direct: bool) -> Settled:
     """Find the light that an object throws on itself from the surface without it.
     `light`: of a first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
-    positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
+    positions. `relative`: whether the scale of the lights, and so of albedo, is unknown. `direct`: whether `light` and `normal` are of an
+    earlier solution, whose albedo holds no bounced light."""
     within = _middles_of(light, pick)
     shown = shown_bounce(*readings_in_shadow(light, within.pixels, normal[:, within.pixels].T, within.readings))
     cost = _cost_of(light, within.pixels, normal[:, within.pixels].T, shape, pick)
     bounced = _is_lit_by_bounces(cost, relative=relative) if shown is None else has_bounced(light, shown)
     if not bounced:
         return Settled(light._replace(arriving=None), shown)
-    if light.field is not None:
-        return Settled(light, shown)
-    return _in_rounds(light, normal, shape, pick, within, cost, relative=relative)._replace(shown=shown)
+    return _in_rounds(light, normal, shape, pick, within, cost, relative=relative, direct=direct)._replace(shown=shown)
 
 
 def _searched(light: DirectLight, pixels: np.ndarray, start: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples]
@@ -181,7 +181,7 @@ def _shown_by_lit(cost: Callable[[float], float]) -> float | None:
 
 
 def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Callable[[np.ndarray], Samples], within: Middles,
-               cost: Callable[[float], float], *, relative: bool) -> Settled:
+               cost: Callable[[float], float], *, relative: bool, direct: bool) -> Settled:
     """Return the light after the rounds. `cost`: of `_cost_of`, before them. Others as of `settle`."""
     assert light.arriving is not None
     solved, block, middles, whole = within
@@ -218,7 +218,8 @@ def _in_rounds(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: C
         turned = found.normal
         again, dimmed = first.copy(), albedo.copy()
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
-        dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
+        if not direct:
+            dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         patches = patches_of(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=None if patches is None else patches.arriving(light.height, projection_of(camera)), albedo=dimmed)
         beyond = None if patches is None else light_from_beyond(patches, camera, directions, light.height, solved)

@@ -1,4 +1,5 @@
-"""Lights that stand near and are declared distant, and one light of five that is declared too weak: named, and covered by σ."""
+"""Lights that stand near and are declared distant, which are found, and one light of five that is declared too weak: named, and covered by
+σ."""
 
 import numpy as np
 import pytest
@@ -44,28 +45,32 @@ def hills(lights: int, *, away: float | None = None, gloss: float = 0.0) -> Scen
 
 def solve(relit, folder, scene):
     write_capture(folder, scene, irradiance_scale="relative")
-    maps, _, said = relit.solve(folder, "--method", "robust", "--max-sigma", "180", code=None, unsure=True)  # all may be ambiguous
-    return angles_degrees(maps.normal, scene.normal), maps.sigma, said
+    maps, report, said = relit.solve(folder, "--method", "robust", "--max-sigma", "180", code=None, unsure=True)  # all may be ambiguous
+    return angles_degrees(maps.normal, scene.normal), maps.sigma, said, report["found"].get("light_distance")
 
 
-@first_short(("lights", "away", "gloss"), [(9, 2.2, 0.0), (6, 3.5, 0.0), (14, 2.6, 0.15)])
+@first_short(("lights", "away", "gloss"), [(9, 2.2, 0.0), (6, 3.5, 0.0), (14, 2.6, 0.15), (16, 6.0, 0.0), (24, 14.0, 0.0)])
 def test_near_lights_that_are_declared_distant(relit, tmp_path, lights, away, gloss):
-    error, sigma, said = solve(relit, tmp_path, hills(lights, away=away, gloss=gloss))
+    """Under distant lights their normals are 8 to 38° off in the median; with noise alone, .3° are left. The gloss of the third is part of
+    what `robust` gets wrong under right lights, too."""
+    error, sigma, said, found = solve(relit, tmp_path, hills(lights, away=away, gloss=gloss))
     assert "the lights look near" in said
-    assert np.median(error) > 4 and np.median(error / sigma) < 1.4  # the bar of docs/trust.md
+    assert away / 1.1 < found["half_widths"] < 1.1 * away  # measured are 4 % at most: the surface is no plane
+    assert np.median(error) < (5 if gloss else 1) and np.median(error / sigma) < 1.4  # the bar of docs/trust.md
 
 
 def test_one_of_five_lights_twice_as_bright_as_declared(relit, tmp_path):
     scene = hills(5)
     scene.images[3] *= 2
-    error, sigma, said = solve(relit, tmp_path, scene)
+    error, sigma, said, _ = solve(relit, tmp_path, scene)
     assert "003.exr looks 2 times as bright" in said
     assert np.median(error / sigma) < 1.4  # the bar of docs/trust.md, whether the fit has left the light out or not
 
 
-@first_short(("lights", "gloss"), [(5, 0.0), (9, 0.4), (14, 0.2)])
+@first_short(("lights", "gloss"), [(5, 0.0), (9, 0.4), (14, 0.2), (24, 0.0)])
 def test_nothing_is_said_of_right_lights(relit, tmp_path, lights, gloss):
-    _, _, said = solve(relit, tmp_path, hills(lights, gloss=gloss))
+    _, _, said, found = solve(relit, tmp_path, hills(lights, gloss=gloss))
+    assert found is None
     assert "look near" not in said and "as bright as declared" not in said
 
 
