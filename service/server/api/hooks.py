@@ -1,6 +1,5 @@
 """Routes of hooks: set a URL that is told how the jobs of the project have ended, look at it, test it, delete it."""
 
-from functools import partial
 from typing import Annotated
 
 import sqlalchemy as sa
@@ -30,14 +29,10 @@ def create_hook(service: ServiceDep, caller: Admin, response: Response, wanted: 
     """Let the URL be told by a signed request (Standard Webhooks) when jobs of the project end. The secret is in this answer alone."""
     outgoing.require_target(wanted.url, service.settings.hook_networks)
     service.limiter.take(caller.key, CREATION_COST - 1)
-
-    def work(connection: sa.Connection) -> sa.RowMapping:
+    with service.database.begin() as connection:
         quotas.require(connection, service.settings, quotas.HOOKS, caller.project, 1)
         row = hooks.insert(connection, caller.project, wanted)
         audit.record(connection, caller, "hook.create", row["id"])
-        return row
-
-    row = service.database.transact(work)
     response.headers["Location"] = f"/v1/hooks/{row['id']}"
     return NewHookView.model_validate({**row, "waiting": 0, "last_delivery": None})
 
@@ -61,17 +56,18 @@ def get_hook(service: ServiceDep, caller: Admin, hook: HookName) -> HookView:
 def send_test(service: ServiceDep, caller: Admin, hook: HookName) -> DeliveryView:
     """Queue a delivery of the type `hook.test`, which is signed, sent and tried again as the others are, and end the pause of the hook."""
     service.limiter.take(caller.key, CREATION_COST - 1)
-    made = audit.recorded(service.database, caller, "hook.test", hook, partial(hooks.record_test, project=caller.project, hook=hook))
-    if made is None:
-        raise _missing(hook)
+    with audit.recorded(service.database, caller, "hook.test", hook) as connection:
+        if (made := hooks.record_test(connection, caller.project, hook)) is None:
+            raise _missing(hook)
     return DeliveryView.model_validate(dict(made))
 
 
 @router.delete("/{hook}", status_code=204, responses=responses(404), summary="Delete a hook")
 def delete_hook(service: ServiceDep, caller: Admin, hook: HookName) -> None:
     """Delete a hook; deliveries that wait are not sent any more."""
-    if not audit.recorded(service.database, caller, "hook.delete", hook, partial(hooks.remove, project=caller.project, hook=hook)):
-        raise _missing(hook)
+    with audit.recorded(service.database, caller, "hook.delete", hook) as connection:
+        if not hooks.remove(connection, caller.project, hook):
+            raise _missing(hook)
 
 
 def _missing(hook: str) -> ApiError:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated
 
@@ -76,17 +75,12 @@ def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) ->
     """Let a capture or environment take no more files while a job looks at it, or refuse the request; `action` is for the audit log."""
     intake = job.intake
     before = row_of(service, caller, intake)
-
-    def work(connection: sa.Connection) -> bool:
+    with audit.recorded(service.database, caller, action, intake) as connection:
         if not intakes.begin_check(connection, intake):
-            return False
+            raise ApiError("conflict", f"{intake} is {before['state']} already")
         if (file := uploads.unfinished(connection, intake)) is not None:
             raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
         submit(service, caller, job, connection, [intake])
-        return True
-
-    if not audit.recorded(service.database, caller, action, intake, work):
-        raise ApiError("conflict", f"{intake} is {before['state']} already")
     return _view(service, caller, intake)
 
 
@@ -123,14 +117,10 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
         row = row_of(service, caller, intake)
         if row["state"] == states.CHECKING:
             raise ApiError("conflict", f"{intake} is being checked")
-
-        def work(connection: sa.Connection) -> list[str] | None:
+        with audit.recorded(service.database, caller, "intake.delete", intake) as connection:
             if users := jobs.users_of(connection, intake):
                 raise ApiError("conflict", f"{intake} is read by {users[0]}, which has not ended")
-            audit.record(connection, caller, "intake.delete", intake)
-            return intakes.remove(connection, intake)
-
-        parts = service.database.transact(work)
+            parts = intakes.remove(connection, intake)
         if parts is not None and row["folder"] is None:
             for upload in parts:
                 service.parts.discard(upload)
@@ -183,15 +173,12 @@ def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, w
     x, y, across, down = wanted.box()
     if x + across > width or y + down > height:
         raise ApiError("invalid", f"target: lies outside the image, which has {width}x{height} pixels")
-
-    def work(connection: sa.Connection) -> AnnotationView:
+    with service.database.begin() as connection:
         row = intakes.annotate(connection, capture, wanted.model_dump(mode="json"))
         if row is None:
             raise ApiError("conflict", f"{capture} has {intakes.MOST_ANNOTATIONS} annotations already: delete one first")
         audit.record(connection, caller, "annotation.create", row["id"])
-        return view_of(capture, row)
-
-    made = service.database.transact(work)
+    made = view_of(capture, row)
     response.headers["Location"] = made.id
     return made
 
@@ -200,9 +187,9 @@ def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, w
 def delete_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, annotation: AnnotationId) -> None:
     """Delete an annotation of a capture."""
     row_of(service, caller, capture)
-    if not audit.recorded(service.database, caller, "annotation.delete", annotation,
-                          partial(intakes.remove_annotation, capture=capture, identifier=annotation)):
-        raise ApiError("not-found", f"there is no {annotation} of {capture}")
+    with audit.recorded(service.database, caller, "annotation.delete", annotation) as connection:
+        if not intakes.remove_annotation(connection, capture, annotation):
+            raise ApiError("not-found", f"there is no {annotation} of {capture}")
 
 
 @environments.post("", status_code=201, responses=responses(404, 409, 507), summary="Create an environment")

@@ -2,10 +2,8 @@
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Any
 
-import sqlalchemy as sa
 from fastapi import APIRouter, Body, Path, Query, Response
 from fastapi.openapi.models import Example
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
@@ -120,8 +118,9 @@ def get_log(service: ServiceDep, caller: Reader, job: JobName) -> JobLog:
 def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
     """Cancel a job: at once if it is queued, else at its next sign of progress. Its results stay."""
     before = view(service, caller, job)
-    if not audit.recorded(service.database, caller, "job.cancel", job, partial(jobs.cancel, job=job)):
-        raise ApiError("conflict", f"{job} is {before.state}: it has ended")
+    with audit.recorded(service.database, caller, "job.cancel", job) as connection:
+        if not jobs.cancel(connection, job):
+            raise ApiError("conflict", f"{job} is {before.state}: it has ended")
     service.queue.cancel(workflow_id(job, before.attempt))
     return view(service, caller, job)
 
@@ -143,15 +142,11 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
                     wanted: Annotated[Priority, Body(openapi_examples={"sooner": {"value": {"priority": 90}}})]) -> JobView:
     """Change the priority of a queued job; it stays the same attempt."""
     before = view(service, caller, job)
-
-    def work(connection: sa.Connection) -> bool:
+    with audit.recorded(service.database, caller, "job.priority", job) as connection:
         attempt = jobs.set_priority(connection, job, wanted.priority)
-        if attempt is not None:
-            service.queue.set_priority(connection, job, attempt, wanted.priority)
-        return attempt is not None
-
-    if not audit.recorded(service.database, caller, "job.priority", job, work):
-        raise ApiError("conflict", f"{job} is {before.state}: only a queued job has a priority to change")
+        if attempt is None:
+            raise ApiError("conflict", f"{job} is {before.state}: only a queued job has a priority to change")
+        service.queue.set_priority(connection, job, attempt, wanted.priority)
     return view(service, caller, job)
 
 
@@ -159,14 +154,11 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
 def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     """Delete a job that has ended, with its results."""
     before = view(service, caller, job)
-
-    def work(connection: sa.Connection) -> bool:
+    with audit.recorded(service.database, caller, "job.delete", job) as connection:
         if users := jobs.users_of(connection, job):
             raise ApiError("conflict", f"{job} is read by {users[0]}, which has not ended")
-        return jobs.remove(connection, job)
-
-    if not audit.recorded(service.database, caller, "job.delete", job, work):
-        raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
+        if not jobs.remove(connection, job):
+            raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
     service.storage.remove(layout.results(caller.project, job))
     service.storage.remove(layout.shared(caller.project, job))
     service.queue.forget(job)
@@ -186,15 +178,11 @@ def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
     request = before.request
     if isinstance(request, CheckJob):
         raise ApiError("conflict", f"{job} is a check: validate {request.intake} again")
-
-    def work(connection: sa.Connection) -> bool:
+    with audit.recorded(service.database, caller, "job.again", job) as connection:
         attempt = jobs.queue_again(connection, job, state)
-        if attempt is not None:
-            service.queue.enqueue(connection, job, attempt, request, before.priority, caller.project)
-            require_queue(service, caller, connection)
-            quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)
-        return attempt is not None
-
-    if not audit.recorded(service.database, caller, "job.again", job, work):
-        raise ApiError("conflict", f"{job} is {before.state}, not {state}")
+        if attempt is None:
+            raise ApiError("conflict", f"{job} is {before.state}, not {state}")
+        service.queue.enqueue(connection, job, attempt, request, before.priority, caller.project)
+        require_queue(service, caller, connection)
+        quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)
     return view(service, caller, job)

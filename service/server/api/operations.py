@@ -3,7 +3,6 @@
 import shutil
 import threading
 import time
-from functools import partial
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
@@ -144,9 +143,9 @@ def _end_worker(service: Service, caller: Caller, worker: str, what: str) -> Wor
     found = next((each for each in _workers(service, caller) if each.id == worker), None)
     if found is not None and found.busy and found.job is None:
         raise ApiError("conflict", f"{worker} does a job of another project")
-    ask = partial(workers.ask, worker=worker, what=what)
-    if found is None or not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:], ask):
-        raise ApiError("not-found", f"there is no worker {worker}")
+    with audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:]) as connection:
+        if found is None or not workers.ask(connection, worker, what):
+            raise ApiError("not-found", f"there is no worker {worker}")
     return found.model_copy(update={"asked": what})
 
 

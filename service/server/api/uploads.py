@@ -3,7 +3,6 @@
 import asyncio
 import time
 from contextlib import closing
-from functools import partial
 from typing import Annotated, Any
 
 import sqlalchemy as sa
@@ -128,14 +127,12 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
     except PartFileLocked:
         raise ApiError("locked", f"{upload}: a request is adding to it", headers={"Retry-After": "1"}) from None
     with closing(part):
-        def work(connection: sa.Connection) -> None:
-            _hold(service, caller, connection, row["intake"])
-            if uploads.remove(connection, upload):
-                audit.record(connection, caller, "upload.delete", upload)
-                service.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
-
         try:
-            service.database.transact(work)
+            with service.database.begin() as connection:
+                _hold(service, caller, connection, row["intake"])
+                if uploads.remove(connection, upload):
+                    audit.record(connection, caller, "upload.delete", upload)
+                    service.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
         finally:
             if row["done"] or uploads.find(service.database, upload, caller.project) is None:
                 part.drop()
@@ -175,7 +172,8 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
     upload = idempotency.create_once(service.database, caller.project, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
     if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
-        service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
+        with service.database.begin() as connection:
+            idempotency.forget_token(connection, caller.project, token, gone=upload)
         upload = idempotency.create_once(service.database, caller.project, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:

@@ -7,8 +7,8 @@ delete a line; who may change the schema of the database can drop them, as `prun
 import getpass
 import time
 from collections import Counter
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import sqlalchemy as sa
 import structlog
@@ -18,7 +18,6 @@ from service.server.database.engine import Database, begin_writing
 from service.server.database.keys import DAY_S, Caller
 from service.server.database.tables import audit
 
-T = TypeVar("T")
 ANONYMOUS = "anonymous"
 REFUSAL = "the audit log is append-only"
 MOST_A_DAY = 10_000
@@ -37,14 +36,12 @@ def record(connection: sa.Connection, caller: Caller, action: str, target: str) 
         request=structlog.contextvars.get_contextvars().get("request")))
 
 
-def recorded(database: Database, caller: Caller, action: str, target: str, change: Callable[[sa.Connection], T]) -> T:
-    """Make a change in a transaction of its own, write that the caller made it, where it returns something, and return that."""
-    def work(connection: sa.Connection) -> T:
-        if made := change(connection):
-            record(connection, caller, action, target)
-        return made
-
-    return database.transact(work)
+@contextmanager
+def recorded(database: Database, caller: Caller, action: str, target: str) -> Iterator[sa.Connection]:
+    """Begin a transaction for a change, and write at its end that the caller has made it; an exception undoes both."""
+    with database.begin() as connection:
+        yield connection
+        record(connection, caller, action, target)
 
 
 def record_operator(connection: sa.Connection, project: str, action: str, target: str) -> None:
@@ -71,17 +68,14 @@ def prune(database: Database, *, before: float, now: float) -> int:
         sa.select(audit.c.project).where(_of_day(begin), ~IS_SUM).group_by(audit.c.project).having(sa.func.count() > MOST_A_DAY))]
     if not crowded and database.row(sa.select(audit.c.id).where(audit.c.at < before)) is None:
         return 0
-
-    def work(connection: sa.Connection) -> int:
+    with database.begin() as connection:
         begin_writing(connection)
         for trigger in TRIGGERS[connection.dialect.name]:
             connection.execute(sa.text(f"DROP TRIGGER {trigger}"))
         gone = connection.execute(audit.delete().where(audit.c.at < before)).rowcount
         gone += sum(_sum_up(connection, project, begin) for project, begin in crowded)
         protect(connection)
-        return gone
-
-    return database.transact(work)
+    return gone
 
 
 def protect(connection: sa.Connection) -> None:

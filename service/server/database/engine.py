@@ -3,7 +3,7 @@
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -45,12 +45,16 @@ class Database:
         """Return whether the database is a file of SQLite."""
         return self.engine.dialect.name == "sqlite"
 
+    def begin(self) -> AbstractContextManager[sa.Connection]:
+        """Begin a transaction, which ends with the block; an exception undoes it."""
+        return self.engine.begin()
+
     def transact(self, work: Callable[[sa.Connection], T], *, patience_s: float = 0.0) -> T:
         """Run `work` in one transaction, which may do nothing else, and again for `patience_s` while the database is away or full."""
         pause, deadline = FIRST_PAUSE_S, time.monotonic() + patience_s
         while True:
             try:
-                with self.engine.begin() as connection:
+                with self.begin() as connection:
                     return work(connection)
             except UNANSWERED:
                 if time.monotonic() + pause > deadline:
@@ -60,17 +64,17 @@ class Database:
 
     def execute(self, statement: sa.Update | sa.Delete | sa.Insert) -> int:
         """Run one statement in a transaction of its own, and return the number of rows that it changed."""
-        return self.transact(lambda connection: connection.execute(statement).rowcount)
+        with self.begin() as connection:
+            return connection.execute(statement).rowcount
 
-    def rows(self, query: "sa.Select[Any]", **parameters: Any) -> list[sa.RowMapping]:
-        """Return all rows of a query, with the values of its `bindparam`s."""
+    def rows(self, query: "sa.Select[Any]") -> list[sa.RowMapping]:
+        """Return all rows of a query."""
         with self.engine.connect() as connection:
-            return list(connection.execute(query, parameters).mappings())
+            return list(connection.execute(query).mappings())
 
-    def row(self, query: "sa.Select[Any]", **parameters: Any) -> sa.RowMapping | None:
-        """Return the first row of a query, as `rows` does; None: there is none."""
-        found = self.rows(query.limit(1), **parameters)
-        return found[0] if found else None
+    def row(self, query: "sa.Select[Any]") -> sa.RowMapping | None:
+        """Return the first row of a query; None: there is none."""
+        return next(iter(self.rows(query.limit(1))), None)
 
     def close(self) -> None:
         """Close the connections."""

@@ -54,9 +54,9 @@ def forget_token(connection: sa.Connection, project: str, token: str, gone: str)
     connection.execute(idempotency.delete().where(*_is(project, token), idempotency.c.made == gone))
 
 
-def drop_before(connection: sa.Connection, when: float) -> None:
+def drop_before(database: Database, when: float) -> None:
     """Forget the tokens of requests before a time."""
-    connection.execute(idempotency.delete().where(idempotency.c.created_at < when))
+    database.execute(idempotency.delete().where(idempotency.c.created_at < when))
 
 
 def _is(project: str, token: str) -> "tuple[sa.ColumnElement[bool], ...]":

@@ -29,12 +29,6 @@ LATELY_S = 60.0
 MOST_ENTRIES = 1000
 """Most entries of the log of a job; what comes after is not recorded."""
 KIND = jobs.c.request["kind"].as_string()
-OF_IDENTIFIERS = sa.select(jobs).where(jobs.c.id.in_(sa.bindparam("jobs", expanding=True)))
-WATCHED = sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(sa.or_(
-    jobs.c.id.in_(sa.bindparam("topics", expanding=True)),
-    sa.and_(jobs.c.project.in_(sa.bindparam("topics", expanding=True)),
-            sa.or_(jobs.c.state.in_(ACTIVE), jobs.c.updated_at > sa.bindparam("since")))))
-"""Queries for the streams of events, made once, as those of `keys` are."""
 
 
 class Claim(NamedTuple):
@@ -94,12 +88,14 @@ def views_of(database: Database, intakes: Sequence[str]) -> dict[str, str]:
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
     """Return identifier, project and revision of jobs, and of those of projects that have not ended or ended lately."""
-    return database.rows(WATCHED, topics=list(topics), since=time.time() - LATELY_S)
+    lately = jobs.c.state.in_(ACTIVE) | (jobs.c.updated_at > time.time() - LATELY_S)
+    return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(
+        jobs.c.id.in_(topics) | (jobs.c.project.in_(topics) & lately)))
 
 
 def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.RowMapping]:
     """Return jobs by their identifiers."""
-    return {row["id"]: row for row in database.rows(OF_IDENTIFIERS, jobs=list(identifiers))}
+    return {row["id"]: row for row in database.rows(sa.select(jobs).where(jobs.c.id.in_(identifiers)))}
 
 
 def count_queued(connection: sa.Connection, project: str, key: str | None) -> int:
@@ -137,9 +133,10 @@ def users_of(connection: sa.Connection, input_id: str) -> list[str]:
 
 def begin(database: Database, claim: Claim) -> bool:
     """Let a worker begin a job; return False if the job was cancelled or another worker has it."""
-    free = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
-    return _change(database, claim, free, entry="begun by a worker", state=RUNNING, worker=claim.worker,
-                   started_at=sa.func.coalesce(jobs.c.started_at, time.time()), version=sa.func.coalesce(jobs.c.version, __version__))
+    return database.transact(lambda connection: _update(
+        connection, claim.job, _free(claim), "begun by a worker", state=RUNNING, worker=claim.worker,
+        started_at=sa.func.coalesce(jobs.c.started_at, time.time()), version=sa.func.coalesce(jobs.c.version, __version__)),
+        patience_s=PATIENCE_S)
 
 
 def begin_anew(database: Database, claim: Claim) -> bool:
@@ -198,7 +195,7 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
     A worker that died in a stage that an earlier worker came through was hardly killed by the job. So it does not count, unless there are
     REPEATED times `limit` of them. Return the new state of the job; None if it had ended.
     """
-    active = [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
+    active = _active(claim)
     row = connection.execute(sa.select(jobs).where(*active).with_for_update()).one_or_none()
     if row is None:
         return None
@@ -206,55 +203,41 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
     lost, repeating = row.lost + (counts and not row.repeating), row.lost_repeating + (counts and row.repeating)
     state, now = FAILED if lost > limit or repeating > REPEATED * limit else QUEUED, time.time()
     sentence = f"lost {lost + repeating} workers without progress ({row.stage or 'begin'}): it may need more memory than they have"
-    done = connection.execute(jobs.update().where(*active).values(
-        state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, updated_at=now,
-        revision=jobs.c.revision + 1,
-        **({"error": sentence, "finished_at": now} if state == FAILED else {})))
-    note(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
+    failed = {"error": sentence, "finished_at": now} if state == FAILED else {}
+    if not _update(connection, claim.job, active, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again",
+                   state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, **failed):
+        return None
     if state == FAILED:
         _end_check(connection, claim.job, sentence)
-        hooks.record_end(connection, claim.job)
-    return state if done.rowcount == 1 else None
+    return state
 
 
 def release(connection: sa.Connection, claim: Claim) -> bool:
     """Queue a job again that the worker had taken; return False if it was cancelled or another worker has it."""
-    mine = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
-    done = connection.execute(jobs.update().where(
-        jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
-        state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1)).rowcount == 1
-    if done:
-        note(connection, claim.job, "given back by its worker, queued again")
-    return done
+    return _update(connection, claim.job, _free(claim), "given back by its worker, queued again", state=QUEUED, worker=None)
 
 
 def cancel(connection: sa.Connection, job: str) -> bool:
     """Cancel a job; return False if it has ended."""
-    now = time.time()
-    done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
-        state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
-    if done.rowcount == 1:
-        note(connection, job, CANCELLED)
+    active = jobs.c.id == job, jobs.c.state.in_(ACTIVE)
+    if done := _update(connection, job, active, CANCELLED, state=CANCELLED, finished_at=time.time()):
         _end_check(connection, job, "its check was cancelled: validate it again")
-        hooks.record_end(connection, job)
-    return done.rowcount == 1
+    return done
 
 
 def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
     """Queue a job again that has ended in `state`; return the number of its new attempt, or None if it is in another state."""
-    done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == state).values(
-        state=QUEUED, attempt=jobs.c.attempt + 1, revision=jobs.c.revision + 1, updated_at=time.time(), finished_at=None,
-        error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
-    if done.rowcount != 1:
+    ended = jobs.c.id == job, jobs.c.state == state
+    if not _update(connection, job, ended, "queued again", state=QUEUED, attempt=jobs.c.attempt + 1, finished_at=None, error=None,
+                   reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None):
         return None
-    note(connection, job, "queued again")
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())
 
 
 def set_priority(connection: sa.Connection, job: str, priority: int) -> int | None:
     """Change the priority of a queued job; return its attempt, whose place in the queue is to change, or None if it is not queued."""
     return connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == QUEUED).values(
-        priority=priority, updated_at=time.time(), revision=jobs.c.revision + 1).returning(jobs.c.attempt)).scalar()
+        priority=priority).returning(jobs.c.attempt)).scalar()
 
 
 def remove(connection: sa.Connection, job: str) -> bool:
@@ -271,13 +254,11 @@ def log_of(database: Database, job: str) -> list[sa.RowMapping]:
 
 def note_once(database: Database, job: str, texts: Sequence[str]) -> None:
     """Add entries to the log of a job that it has not, as those of a step that is done again."""
-    def work(connection: sa.Connection) -> None:
+    with database.begin() as connection:
         there = set(connection.scalars(sa.select(job_log.c.text).where(job_log.c.job == job)))
         for text in dict.fromkeys(map(storable, texts)):
             if text not in there:
                 note(connection, job, text)
-
-    database.transact(work)
 
 
 def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
@@ -285,8 +266,17 @@ def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
     return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.attempt).where(jobs.c.state.in_(ENDED), jobs.c.finished_at < when))
 
 
+def _active(claim: Claim) -> list[sa.ColumnElement[bool]]:
+    return [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
+
+
 def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
-    return [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.worker == claim.worker, jobs.c.state.in_(ACTIVE)]
+    return [*_active(claim), jobs.c.worker == claim.worker]
+
+
+def _free(claim: Claim) -> list[sa.ColumnElement[bool]]:
+    """Return the conditions under which a worker may take a job: nobody has it, or the worker itself."""
+    return [*_active(claim), jobs.c.worker.is_(None) | (jobs.c.worker == claim.worker)]
 
 
 def note(connection: sa.Connection, job: str, text: str) -> None:
@@ -304,18 +294,17 @@ def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
         state=REFUSED, problem=problem))
 
 
-def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, entry: str | None = None,
-            patience_s: float = PATIENCE_S, **values: Any) -> bool:
-    """Change a job that the worker has or, with the condition `free`, may take; `entry` is added to its log."""
-    found = _held(claim) if free is None else [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), free]
-    statement = jobs.update().where(*found).values(updated_at=time.time(), revision=jobs.c.revision + 1, **values)
+def _change(database: Database, claim: Claim, *, entry: str | None = None, patience_s: float = PATIENCE_S, **values: Any) -> bool:
+    """Change a job that the worker has, as `_update` does."""
+    return database.transact(lambda connection: _update(connection, claim.job, _held(claim), entry, **values), patience_s=patience_s)
 
-    def work(connection: sa.Connection) -> bool:
-        changed = connection.execute(statement).rowcount == 1
-        if changed and entry is not None:
-            note(connection, claim.job, entry)
-        if changed and values.get("state") in ENDED:
-            hooks.record_end(connection, claim.job)
-        return changed
 
-    return database.transact(work, patience_s=patience_s)
+def _update(connection: sa.Connection, job: str, where: Iterable[sa.ColumnElement[bool]], entry: str | None, **values: Any) -> bool:
+    """Change a job for which these conditions hold, add an entry to its log, and tell hooks of its end; return False if they do not."""
+    if connection.execute(jobs.update().where(*where).values(**values)).rowcount != 1:
+        return False
+    if entry is not None:
+        note(connection, job, entry)
+    if values.get("state") in ENDED:
+        hooks.record_end(connection, job)
+    return True

@@ -23,12 +23,6 @@ ORDER = list(Scope)
 DAY_S = 86_400.0
 USED_S = 60.0
 """Seconds to which the last use of a key is recorded, so that not every request writes."""
-FOUND = sa.select(keys).where(keys.c.id == sa.bindparam("key"))
-STILL_VALID = sa.select(keys.c.id).where(
-    keys.c.id.in_(sa.bindparam("keys", expanding=True)), keys.c.revoked_at.is_(None),
-    sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
-"""Queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
-and those of each request would wait for the garbage collector."""
 
 
 class Caller(NamedTuple):
@@ -61,7 +55,7 @@ def find(database: Database, presented: str) -> Caller | str:
     A use of the key is recorded.
     """
     identifier, _, secret = presented.partition(".")
-    row, now = database.row(FOUND, key=identifier), time.time()
+    row, now = database.row(sa.select(keys).where(keys.c.id == identifier)), time.time()
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
         return "this service does not know the key"
     if row["revoked_at"] is not None:
@@ -76,7 +70,9 @@ def find(database: Database, presented: str) -> Caller | str:
 def no_longer_valid(database: Database, callers: Collection[Caller]) -> set[Caller]:
     """Return those of the callers whose key or token was revoked or has expired."""
     now, used = time.time(), {caller.key for caller in callers if (caller.key or "").startswith(f"{KEY}_")}
-    valid = {row["id"] for row in database.rows(STILL_VALID, keys=list(used), now=now)} if used else set()
+    unexpired = keys.c.expires_at.is_(None) | (keys.c.expires_at > now)
+    still = sa.select(keys.c.id).where(keys.c.id.in_(used), keys.c.revoked_at.is_(None), unexpired)
+    valid = {row["id"] for row in database.rows(still)} if used else set()
     return {caller for caller in callers if caller.key in used - valid or (caller.until is not None and caller.until < now)}
 
 

@@ -3,6 +3,7 @@
 A change of a table needs a revision in `migrations/versions`, which changes the databases that exist (service.server.database.schema).
 """
 
+import time
 from typing import Any
 
 import sqlalchemy as sa
@@ -90,9 +91,9 @@ jobs = sa.Table(
     # number of the workflow, from 1. A retry is a new workflow: DBOS does not resume one that has ended, and a worker that has not yet
     # noticed the end of the old one must change nothing in the new one (test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more)
     sa.Column("attempt", sa.Integer, nullable=False),
-    sa.Column("revision", sa.BigInteger, nullable=False),  # grows with every change
+    sa.Column("revision", sa.BigInteger, nullable=False, onupdate=sa.text("revision + 1")),  # grows with every change
     sa.Column("created_at", sa.Float, nullable=False),
-    sa.Column("updated_at", sa.Float, nullable=False),
+    sa.Column("updated_at", sa.Float, nullable=False, onupdate=time.time),
     sa.Column("started_at", sa.Float),  # of the first attempt; DBOS has that of the latest start
     sa.Column("finished_at", sa.Float),
     # the worker that may change the row; DBOS has it as executor_id of the workflow. It has to stand in the row that is changed: an

@@ -23,7 +23,8 @@ def insert(database: Database, worker: str, *, host: str, pid: int, device: str)
 def record_alive(database: Database, worker: str, state: str = READY) -> str | None:
     """Record that a worker is alive, and its state; return what an operator asks of it."""
     alive = workers.update().where(workers.c.id == worker).values(seen_at=time.time(), state=state).returning(workers.c.asked)
-    return database.transact(lambda connection: connection.execute(alive).scalar())
+    with database.begin() as connection:
+        return connection.execute(alive).scalar()
 
 
 def ask(connection: sa.Connection, worker: str, what: str) -> bool:

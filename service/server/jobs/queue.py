@@ -99,12 +99,10 @@ class JobQueue:
 
     def ask_for_help(self, job: str, attempt: int, priority: int, workers: int, project: str) -> None:
         """Queue work for workers that have no other: to help with a job that another worker does."""
-        def enqueue(connection: sa.Connection) -> None:
+        with self._database.begin() as connection:
             for _ in range(workers):
                 workflow = f"{workflow_id(job, attempt)}.{secrets.token_hex(4)}"
                 self._enqueue(connection, HELP, WORK, workflow, priority, project, workflow)
-
-        self._database.transact(enqueue)
 
     def _enqueue(self, connection: sa.Connection, name: str, queue: str, workflow: str, priority: int, project: str, *given: Any) -> None:
         self._client.enqueue_in_transaction(connection, {
@@ -124,8 +122,9 @@ class JobQueue:
 
     def return_job(self, workflow: str, worker: str) -> None:
         """Queue a workflow again that the calling worker had taken and does not finish."""
-        claim = Claim(*job_and_attempt(workflow), worker)
-        if not is_help(workflow) and self._database.transact(lambda connection: jobs.release(connection, claim)):
+        with self._database.begin() as connection:
+            released = not is_help(workflow) and jobs.release(connection, Claim(*job_and_attempt(workflow), worker))
+        if released:
             self.requeue(workflow)
         else:  # also of help, as the worker that has the job does what is left
             self.cancel(workflow)

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
-from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -213,8 +212,10 @@ class Takeover(Rounds):
         if workflows:
             logger.warning("worker died", dead=worker, jobs=[job_and_attempt(workflow)[0] for workflow in workflows])
         for workflow in workflows:
-            record = partial(jobs.record_lost_worker, claim=Claim(*job_and_attempt(workflow), worker), limit=self._max_lost)
-            if not is_help(workflow) and self._database.transact(record) == QUEUED:
+            with self._database.begin() as connection:
+                state = None if is_help(workflow) else jobs.record_lost_worker(
+                    connection, Claim(*job_and_attempt(workflow), worker), self._max_lost)
+            if state == QUEUED:
                 self._queue.requeue(workflow)
             else:  # also of help, as the worker that has the job does what is left
                 self._queue.cancel(workflow)

@@ -13,7 +13,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from functools import partial
 
 import sqlalchemy as sa
 
@@ -70,7 +69,8 @@ class HookSender(Rounds):
                 if row["id"] in self._busy or of_project >= OF_PROJECT or len(self._busy) >= AT_ONCE:
                     continue
             now = self._clock()
-            taken = self._database.transact(partial(hooks.take, hook=row["id"], now=now, until=now + LEASE_S))
+            with self._database.begin() as connection:
+                taken = hooks.take(connection, row["id"], now=now, until=now + LEASE_S)
             if taken is not None:
                 thread = threading.Thread(target=self._try, args=(taken,), name=f"relit-{taken['id']}", daemon=True)
                 with self._lock:  # for which the thread waits at its end

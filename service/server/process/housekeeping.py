@@ -95,7 +95,9 @@ class Housekeeper(Rounds):
             self._try(row["id"], partial(self._remove_job, row))
 
     def _remove_job(self, row: sa.RowMapping) -> None:
-        if self._database.transact(lambda connection: not jobs.users_of(connection, row["id"]) and jobs.remove(connection, row["id"])):
+        with self._database.begin() as connection:
+            removed = not jobs.users_of(connection, row["id"]) and jobs.remove(connection, row["id"])
+        if removed:
             self._storage.remove(layout.results(row["project"], row["id"]))
             self._storage.remove(layout.shared(row["project"], row["id"]))
             self._queue.forget(row["id"])
@@ -106,16 +108,14 @@ class Housekeeper(Rounds):
             logger.info("uploads removed", count=removed)
 
     def _tokens(self) -> None:
-        self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
+        idempotency.drop_before(self._database, self._clock() - TOKEN_S)
 
     def _deliveries(self) -> None:
-        def work(connection: sa.Connection) -> None:
+        with self._database.begin() as connection:
             for row in hooks.give_up(connection, self._clock() - GIVE_UP_S):
                 if row["job"] is not None:
                     jobs.note(connection, row["job"], f"{row['hook']} given up after {row['tries']} tries: {row['answer']}")
             hooks.drop_before(connection, self._clock() - DELIVERY_S)
-
-        self._database.transact(work)
 
     def _audit(self) -> None:
         now = self._clock()
@@ -151,7 +151,9 @@ class Housekeeper(Rounds):
             total -= 0 if there[name].exists() else sizes[name]
 
     def _clear_unread(self, cache: Path) -> None:
-        if not self._database.transact(partial(jobs.users_of, input_id=cache.name)):
+        with self._database.begin() as connection:
+            in_use = jobs.users_of(connection, cache.name)
+        if not in_use:
             _clear(cache)
 
     def _leftovers(self) -> None:
@@ -202,11 +204,7 @@ class ClockWatch:
             if not -STEP_S <= jump <= (DOWNTIME_S if self._looked is None else STEP_S):
                 logger.error("the clock jumped: for a day nothing is removed for its age", jump_s=round(jump))
                 waits_s = WAIT_S
-        self._database.transact(lambda connection: _record(connection, now, waits_s))
+        if self._database.execute(clock_table.update().values(seen_at=now, waits_s=waits_s)) == 0:
+            self._database.execute(clock_table.insert().values(id=1, seen_at=now, waits_s=waits_s))
         self._looked = monotonic
         return waits_s == 0.0
-
-
-def _record(connection: sa.Connection, now: float, waits_s: float) -> None:
-    if connection.execute(clock_table.update().values(seen_at=now, waits_s=waits_s)).rowcount == 0:
-        connection.execute(clock_table.insert().values(id=1, seen_at=now, waits_s=waits_s))

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import sqlalchemy as sa
-
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
 from service.requests.jobs import CheckJob, PipelineJob, ViewJob
@@ -65,8 +63,9 @@ def _add(database: Database, storage: Storage, request: JobRequest, files: Seque
         shutil.copyfile(file, folder / f".{file.name}")
         (folder / f".{file.name}").rename(folder / file.name)
     storage.publish(prefix)
-    return database.transact(lambda connection: jobs.insert(connection, project=DEFAULT_PROJECT, key=None, request=request, chunk_frames=1,
-                                                            inputs=inputs, finished=identifier))
+    with database.begin() as connection:
+        return jobs.insert(connection, project=DEFAULT_PROJECT, key=None, request=request, chunk_frames=1, inputs=inputs,
+                           finished=identifier)
 
 
 def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> str:
@@ -74,11 +73,8 @@ def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> s
         if row["folder"] == str(path) and row["state"] != REFUSED:
             return str(row["id"])
     identifier = new_id(kind)
-
-    def work(connection: sa.Connection) -> None:
+    with database.begin() as connection:
         intakes.insert(connection, identifier=identifier, project=DEFAULT_PROJECT, kind=kind, name=path.name, folder=str(path))
         queue.submit(connection, project=DEFAULT_PROJECT, key=None, request=CheckJob(kind="check", intake=identifier), chunk_frames=1,
                      inputs=[identifier])
-
-    database.transact(work)
     return identifier
