@@ -153,7 +153,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
         if before is not None and before["done"]:
             uploads.remove(connection, before["id"])
             service.storage.delete(layout.intake(caller.project, intake), given.path)
-        elif before is not None and _expired(service, dict(before)):
+        elif before is not None and _expired(service, before):
             uploads.remove(connection, before["id"])  # its part file, which nobody can continue, goes with the next housekeeping
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")

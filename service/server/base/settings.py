@@ -257,6 +257,11 @@ class Settings(BaseSettings):
         return self.data / "locks"
 
     @property
+    def part_files(self) -> Path:
+        """Folder of the bytes of incomplete uploads."""
+        return self.data / "uploads"
+
+    @property
     def cache(self) -> Path:
         """Folder of the image stacks that this machine caches."""
         return self.data / "cache"

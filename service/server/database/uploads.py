@@ -13,7 +13,7 @@ from service.server.base.safe_names import folded, folders_of, shown
 from service.server.database.engine import Database
 from service.server.database.tables import uploads
 
-Row = Mapping[str, Any]
+Row = Mapping[Any, Any]
 """A row of the uploads table."""
 AFTER_SLASH = "0"
 """The character after /: the paths of the files in a folder sort between the two."""
@@ -25,27 +25,27 @@ class PathTaken(Exception):
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
     """Insert an upload without bytes; the caller has locked the intake."""
-    _require_free(connection, intake, path)
-    connection.execute(uploads.insert().values(
-        id=identifier, project=project, intake=intake, path=path, folded=folded(path), length=length, received=0, sha256=sha256,
-        touched_at=time.time(), done=False))
+    _insert(connection, id=identifier, project=project, intake=intake, path=path, length=length, received=0, sha256=sha256, done=False)
 
 
 def insert_made(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int) -> None:
     """Insert a file that the service has made and put into the storage, in place of another of its path; the caller has locked the
     intake."""
     connection.execute(uploads.delete().where(uploads.c.intake == intake, uploads.c.path == path))
-    insert(connection, identifier=identifier, project=project, intake=intake, path=path, length=length, sha256=None)
-    connection.execute(uploads.update().where(uploads.c.id == identifier).values(received=length, done=True, pieces=[]))
+    _insert(connection, id=identifier, project=project, intake=intake, path=path, length=length, received=length, done=True)
+
+
+def _insert(connection: sa.Connection, *, intake: str, path: str, **values: Any) -> None:
+    _require_free(connection, intake, path)
+    connection.execute(uploads.insert().values(intake=intake, path=path, folded=folded(path), touched_at=time.time(), **values))
 
 
 def find(database: Database, identifier: str, project: str) -> Row | None:
     """Return an upload of a project, or None."""
-    row = database.row(sa.select(uploads).where(uploads.c.id == identifier, uploads.c.project == project))
-    return None if row is None else dict(row)
+    return database.row(sa.select(uploads).where(uploads.c.id == identifier, uploads.c.project == project))
 
 
-def at_path(connection: sa.Connection, intake: str, path: str) -> sa.RowMapping | None:
+def at_path(connection: sa.Connection, intake: str, path: str) -> Row | None:
     """Return the upload that will be stored at `path`, or None."""
     return connection.execute(sa.select(uploads).where(uploads.c.intake == intake, uploads.c.path == path)).mappings().one_or_none()
 
@@ -55,17 +55,17 @@ def count(connection: sa.Connection, intake: str) -> int:
     return int(connection.execute(sa.select(sa.func.count()).where(uploads.c.intake == intake)).scalar_one())
 
 
-def unfinished(connection: sa.Connection, intake: str) -> sa.RowMapping | None:
+def unfinished(connection: sa.Connection, intake: str) -> Row | None:
     """Return a file of an intake that is not complete; None: all are complete."""
     return connection.execute(sa.select(uploads).where(uploads.c.intake == intake, uploads.c.done.is_(False)).limit(1)).mappings().first()
 
 
-def listing(database: Database, intake: str, *, limit: int, after: str | None = None) -> list[Row]:
+def listing(database: Database, intake: str, *, limit: int, after: str | None = None) -> Sequence[Row]:
     """Return a page of the files of an intake, by path; with `after`, those after that path."""
     query = sa.select(uploads).where(uploads.c.intake == intake)
     if after is not None:
         query = query.where(uploads.c.folded > folded(after))
-    return [dict(row) for row in database.rows(query.order_by(uploads.c.folded).limit(limit))]
+    return database.rows(query.order_by(uploads.c.folded).limit(limit))
 
 
 def take(database: Database, identifier: str, writer: str, *, now: float, until: float) -> bool:
@@ -105,9 +105,9 @@ def remove(connection: sa.Connection, identifier: str) -> bool:
     return connection.execute(uploads.delete().where(uploads.c.id == identifier)).rowcount == 1
 
 
-def untouched(database: Database, before: float) -> list[Row]:
+def untouched(database: Database, before: float) -> Sequence[Row]:
     """Return the uploads that were not continued since a time."""
-    return [dict(row) for row in database.rows(sa.select(uploads).where(uploads.c.done.is_(False), uploads.c.touched_at < before))]
+    return database.rows(sa.select(uploads).where(uploads.c.done.is_(False), uploads.c.touched_at < before))
 
 
 def unfinished_of(database: Database, identifiers: Collection[str]) -> set[str]:

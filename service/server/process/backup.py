@@ -36,7 +36,6 @@ from service.server.storage import layout
 from service.server.storage.bucket import Bucket, Object
 from service.server.storage.folder import REMOVED, is_shown
 from service.server.storage.objects import TRANSFERS
-from service.server.storage.upload_parts import part_files_folder
 from stage.errors import StorageError, storage
 from stage.files import write_text
 
@@ -123,9 +122,10 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     else:
         _postgres(settings, "pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--file={out / DUMP}")
     found = {name: _entry(out / name) for name in (SQLITE, DUMP) if (out / name).exists()}
-    part_files = part_files_folder(settings)
-    for folder in (part_files,) if settings.storage_url is not None else (settings.data / PROJECTS, part_files):
-        keep = _copy if folder == part_files else _link  # a client may add to part files meanwhile
+    folders = {settings.part_files: _copy}  # to which a client may add meanwhile; one that is complete lies in the next folder
+    if settings.storage_url is None:
+        folders[settings.data / PROJECTS] = _link
+    for folder, keep in folders.items():
         for path in _files(folder):
             name = path.relative_to(settings.data).as_posix()
             if keep(path, out / name):

@@ -313,12 +313,9 @@ class StoredParts(UploadParts):
                 logger.warning("locks of uploads are not renewed", error=message_of(error))
 
 
-def part_files_folder(settings: Settings) -> Path:
-    """Return the folder of the part files."""
-    return settings.data / "uploads"
-
 
 def open_upload_parts(settings: Settings, database: Database, storage: Storage) -> UploadParts:
     """Return the part files of the service that the settings describe."""
-    folder = part_files_folder(settings)
-    return UploadParts(folder, database) if settings.storage_url is None else StoredParts(folder, database, storage)
+    if settings.storage_url is None:
+        return UploadParts(settings.part_files, database)
+    return StoredParts(settings.part_files, database, storage)

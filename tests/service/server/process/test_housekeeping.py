@@ -11,7 +11,7 @@ from service.server.database import audit, idempotency, intakes, jobs, tables, u
 from service.server.process import housekeeping
 from service.server.process.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
 from service.server.storage import layout
-from service.server.storage.upload_parts import open_upload_parts, part_files_folder
+from service.server.storage.upload_parts import open_upload_parts
 from tests.service.server.process.house import DAYS, PROJECT, House
 from tests.service.waiting import until
 
@@ -60,7 +60,7 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 
 
 def test_uploads_that_nobody_goes_on_with_expire(house):
-    capture, folder = house.capture(), part_files_folder(house.settings)
+    capture, folder = house.capture(), house.settings.part_files
     parts = open_upload_parts(house.settings, house.database, house.storage)
     upload, done = new_id(UPLOAD), new_id(UPLOAD)
     for identifier in (upload, done):

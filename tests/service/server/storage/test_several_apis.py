@@ -19,7 +19,7 @@ from service.server.database import uploads
 from service.server.database.engine import connect
 from service.server.storage import upload_parts
 from service.server.storage.objects import open_storage
-from service.server.storage.upload_parts import open_upload_parts, part_files_folder
+from service.server.storage.upload_parts import open_upload_parts
 from tests.service.server.api.test_watch import queue
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving
@@ -153,7 +153,7 @@ def test_deleted_and_expired_uploads_leave_no_pieces(site):
     parts = open_upload_parts(settings, database, open_storage(settings))
     (site.store / "uploads" / "up_orphan").mkdir()
     (site.store / "uploads" / "up_orphan" / "0").write_bytes(b"x")
-    sent = part_files_folder(settings) / "up_orphan-0.part.piece"  # as an API that was killed while it sent this leaves it
+    sent = settings.part_files / "up_orphan-0.part.piece"  # as an API that was killed while it sent this leaves it
     sent.write_bytes(b"x")
     row = uploads.find(database, busy.rpartition("/")[2], "default")
     with closing(parts.open(row)):  # a request adds to it

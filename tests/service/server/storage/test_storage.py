@@ -12,7 +12,6 @@ from service.server.storage import layout, objects
 from service.server.storage.bucket import PIECE_BYTES
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import SCRATCH, Storage
-from service.server.storage.upload_parts import part_files_folder
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
@@ -147,7 +146,7 @@ def test_every_name_is_in_the_docs(tmp_path):
         assert f"{os.path.dirname(layout.intake('PROJECT', identifiers.new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
     assert f"{os.path.dirname(layout.results('PROJECT', identifiers.new_id(identifiers.JOB)))}/ID/…" in TEXT
     for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", "keys.json",
-                 f"{part_files_folder(settings).name}/", f"{settings.cache.name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
+                 f"{settings.part_files.name}/", f"{settings.cache.name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
                  objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
         assert name in TEXT, name
     assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
