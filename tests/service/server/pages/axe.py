@@ -24,9 +24,17 @@ def violations(page, options: dict | None = None) -> list[str]:
     return [f"{each['id']}: {each['help']}: {node['html']}" for each in found for node in each["nodes"]]
 
 
-def violations_in_both_schemes(page) -> list[str]:
-    """The same in the light scheme, and what is wrong with the colours of the dark one."""
+def assert_accessible(page, *widths: int) -> None:
+    """All is within the width of each of these windows, and axe finds nothing in the light scheme, nor with the colours of the dark one."""
+    assert_fits(page, *widths)
     page.emulate_media(color_scheme="light")
     found = violations(page)
     page.emulate_media(color_scheme="dark")
-    return found + violations(page, COLOURS)
+    assert found + violations(page, COLOURS) == []
+
+
+def assert_fits(page, *widths: int) -> None:
+    """All is within the width: 390 px is a telephone, 640 px a screen of 1280 px at 200 %."""
+    for width in widths:
+        page.set_viewport_size({"width": width, "height": 844})
+        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)

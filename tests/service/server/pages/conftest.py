@@ -6,6 +6,7 @@ Chromium is Debian's. Without it these tests are skipped, unless RELIT_TEST_PAGE
 import io
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,11 @@ PAGE_BYTES = 3_000_000
 """Largest page without data, as the issue asks."""
 MAX_SIGMA = 0.3
 """Largest standard error in degrees of a normal that counts as solved here, so that the capture has unsure pixels too."""
+
+WITHOUT_WEBGL = """const { getContext } = HTMLCanvasElement.prototype;
+HTMLCanvasElement.prototype.getContext = function (kind, ...given) {
+  return kind === "webgl2" ? null : getContext.call(this, kind, ...given);
+};"""
 
 PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
 """The folder for the pictures of the documentation; without it they are made and dropped."""
@@ -100,19 +106,33 @@ def new_context(browser, **options):
     return made
 
 
-@pytest.fixture
-def page(browser, server: Server):
-    """A page of 1280 × 900 px; an error of a script, a breach of the content security policy or a request to another server fails
-    the test."""
-    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 900})
-    opened, errors = context.new_page(), []
-    own = (f"{server.url}/", "blob:", "data:")
-    opened.on("request", lambda request: None if request.url.startswith(own) else errors.append(f"asks {request.url}"))
-    opened.on("pageerror", lambda error: errors.append(str(error)))
-    opened.on("console", lambda message: errors.append(message.text) if "Content Security Policy" in message.text else None)
-    yield opened
+@contextmanager
+def opened_page(browser, **options):
+    """A page in a context of its own; an error of a script or a breach of the content security policy fails the test."""
+    context = new_context(browser, **options)
+    page, errors = context.new_page(), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if "Content Security Policy" in message.text else None)
+    yield page
     context.close()
     assert errors == []
+
+
+@pytest.fixture
+def page(browser, server: Server):
+    """A page of 1280 × 900 px, which may ask no other server."""
+    own, others = (f"{server.url}/", "blob:", "data:"), []
+    with opened_page(browser, base_url=server.url, viewport={"width": 1280, "height": 900}) as opened:
+        opened.on("request", lambda request: None if request.url.startswith(own) else others.append(request.url))
+        yield opened
+    assert others == []
+
+
+@pytest.fixture
+def open_to_axe(browser, server: Server):
+    """A page whose policy lets axe be injected."""
+    with opened_page(browser, base_url=server.url, bypass_csp=True) as opened:
+        yield opened
 
 
 @pytest.fixture

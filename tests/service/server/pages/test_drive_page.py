@@ -6,8 +6,8 @@ import pytest
 
 from stage.transforms import fibonacci_sphere
 from tests.scenes.rigs import write_rig
-from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, done, expect, new_context, seen
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import PICTURES, done, expect, seen
 
 pytestmark = pytest.mark.long
 
@@ -71,12 +71,7 @@ def test_a_job_of_another_kind_is_said(page, solved):
     page.locator("#state", has_text="This job drives no rig.").wait_for()
 
 
-def test_the_page_fits_and_has_no_violation(browser, server, driven):
-    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
-    page.goto(f"/drive/{driven}")
-    page.locator("#dome circle[fill]").first.wait_for()
-    for width in (1280, 390):
-        page.set_viewport_size({"width": width, "height": 844})
-        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
-    assert violations_in_both_schemes(page) == []
-    page.close()
+def test_the_page_fits_and_has_no_violation(open_to_axe, driven):
+    open_to_axe.goto(f"/drive/{driven}")
+    open_to_axe.locator("#dome circle[fill]").first.wait_for()
+    assert_accessible(open_to_axe, 1280, 390)

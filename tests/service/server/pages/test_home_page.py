@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from service.requests.keys import Scope
-from tests.service.server.pages.conftest import await_whole, expect, keep, new_context, seen
+from tests.service.server.pages.conftest import await_whole, expect, opened_page, seen
 from tests.service.server_process import serving
 
 CAPTURES = 1000
@@ -164,10 +164,8 @@ def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card
 @pytest.mark.long
 def test_the_sample_is_opened_by_one_click_where_nothing_is_yet(browser, tmp_path):
     """A key of scope write suffices; the folder of the sample is none that this operator allows for others."""
-    with serving(tmp_path / "empty", "--device", "cpu") as empty:
-        context = new_context(browser, base_url=empty.url)
-        context.add_init_script(f"sessionStorage.setItem('relit-key', '{empty.key(scope=Scope.WRITE)}')")
-        page = context.new_page()
+    with serving(tmp_path / "empty", "--device", "cpu") as empty, opened_page(browser, base_url=empty.url) as page:
+        page.add_init_script(f"sessionStorage.setItem('relit-key', '{empty.key(scope=Scope.WRITE)}')")
         page.goto("/")
         page.get_by_role("button", name="Open the sample owl").click()
         page.locator(".card", has_text="owl").locator("canvas").wait_for()  # it was checked, and has a view
@@ -175,7 +173,6 @@ def test_the_sample_is_opened_by_one_click_where_nothing_is_yet(browser, tmp_pat
         seen(page, lambda: sorted(page.locator("#wall h3").all_inner_texts()) == ["environment.exr", "owl"])
         page.locator(".card a", has_text="owl").click()
         page.locator("canvas.picture[data-ready]").wait_for()
-        context.close()
 
 
 @pytest.mark.long
@@ -242,27 +239,14 @@ def test_the_wall_is_used_by_the_keyboard_alone(page, solved):
 
 @pytest.mark.long
 def test_light_and_dark_are_chosen_and_kept(browser, server):
-    context = new_context(browser, base_url=server.url, color_scheme="light")
-    page = context.new_page()
-    page.goto("/jobs")
     paper = "() => getComputedStyle(document.body).backgroundColor"
-    light = page.evaluate(paper)
-    page.get_by_role("button", name="Show in dark").click()
-    dark = seen(page, lambda: (now := page.evaluate(paper)) != light and now)
-    page.goto("/captures")
-    page.wait_for_function(f"(dark) => ({paper})() === dark", arg=dark)
-    page.get_by_role("button", name="Show in light").click()
-    page.wait_for_function(f"(light) => ({paper})() === light", arg=light)
-    context.close()
+    with opened_page(browser, base_url=server.url, color_scheme="light") as page:
+        page.goto("/jobs")
+        light = page.evaluate(paper)
+        page.get_by_role("button", name="Show in dark").click()
+        dark = seen(page, lambda: (now := page.evaluate(paper)) != light and now)
+        page.goto("/captures")
+        page.wait_for_function(f"(dark) => ({paper})() === dark", arg=dark)
+        page.get_by_role("button", name="Show in light").click()
+        page.wait_for_function(f"(light) => ({paper})() === light", arg=light)
 
-
-@pytest.mark.long
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_home_page_shows_the_sample(browser, owl, solved, sky, tmp_path, scheme):
-    page = new_context(browser, base_url=owl.server.url, viewport={"width": 1280, "height": 720}, color_scheme=scheme).new_page()
-    page.goto("/")
-    for name in (owl.capture, solved.capture, sky):
-        await_picture(page, name)
-    page.evaluate("scrollTo(0, 0)")
-    keep(page, f"home_{scheme}", tmp_path)
-    page.close()

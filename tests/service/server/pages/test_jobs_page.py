@@ -289,7 +289,7 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
         page.close()
 
 
-def test_the_list_follows_all_jobs_and_what_is_not_there_is_said(server, page, capture):
+def test_the_list_follows_all_jobs(server, page, capture):
     page.goto("/jobs")
     with server.client() as client:
         request = {"kind": "solve", "capture": capture, "name": "seen", "options": {"method": "lambert"}}
@@ -298,5 +298,3 @@ def test_the_list_follows_all_jobs_and_what_is_not_there_is_said(server, page, c
         row.locator(".state.succeeded").wait_for(timeout=JOB_MS)
         client.delete(f"/v1/jobs/{job}").raise_for_status()
         row.wait_for(state="detached")
-    page.goto("/jobs/job_0123456789abcdefghjk")
-    page.get_by_role("alert").get_by_text("there is no job_0123456789abcdefghjk in this project").wait_for()

@@ -11,7 +11,7 @@ from service.publish.publish import publish
 from service.requests.publish import PublishRequest
 from tests.service.publish.published import Files, served, shown
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, new_context, seen
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, opened_page, seen
 
 pytestmark = pytest.mark.long
 MOST_BYTES = 2_000_000
@@ -37,12 +37,10 @@ def owl(tmp_path_factory):
 @pytest.fixture(params=[False])
 def page(browser, request):
     """A page; its policy refuses scripts of others, as those by which tests wait and look are, unless the parameter lifts it."""
-    context = new_context(browser, viewport=SMALL, bypass_csp=request.param)
-    page, errors = context.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    yield page
-    context.close()
+    errors = []
+    with opened_page(browser, viewport=SMALL, bypass_csp=request.param) as page:
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        yield page
     assert errors == []
 
 
@@ -186,9 +184,7 @@ def test_two_fingers_zoom(owl, page):
 
 
 def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):
-    context = new_context(browser)
-    page = context.new_page()
-    page.route("**/plane_3_files/**", lambda route: route.fulfill(status=404))
-    page.goto(owl[1])
-    page.locator("#state", has_text="cannot be read (404)").wait_for()
-    context.close()
+    with opened_page(browser) as page:
+        page.route("**/plane_3_files/**", lambda route: route.fulfill(status=404))
+        page.goto(owl[1])
+        page.locator("#state", has_text="cannot be read (404)").wait_for()

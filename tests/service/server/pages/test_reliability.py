@@ -160,11 +160,3 @@ def test_what_stays_away_is_said_with_a_button_and_comes_back(browser, own):
     wait_alive(page, "light")
     context.close()
 
-
-def test_what_is_not_there_says_where_to_go(browser, own):
-    page = new_context(browser, base_url=own[0].server.url).new_page()
-    page.goto("/captures/cap_0123456789abcdefghjk")
-    alert = page.get_by_role("alert")
-    alert.get_by_text("there is no cap_0123456789abcdefghjk in this project").wait_for()
-    alert.get_by_role("link", name="All captures").click()
-    page.close()

@@ -4,9 +4,10 @@
 import pytest
 
 from tests.service.server.api.job_calls import admitted
-from tests.service.server.pages.conftest import SAMPLES, done, keep, new_context
+from tests.service.server.pages.conftest import SAMPLES, done, expect, keep, new_context
 from tests.service.server.pages.frames import assert_same, picture, rendered
 from tests.service.server.pages.photographs import write_photographs
+from tests.service.server.pages.test_home_page import await_picture
 
 pytestmark = pytest.mark.long
 
@@ -27,20 +28,21 @@ def shown(server, material, sky) -> dict[str, str]:
         "captures": "/captures", "jobs": "/jobs", "job": f"/jobs/{made}", "maps": f"{material.pages['maps']}#layer=normal&with=roughness",
         "asset": f"{page}#mode=3d", "compare": f"{page}#mode=compare&how=beside", "frames": f"{page}#mode=frames",
         "object": f"{page}#mode=photographs", "depth": f"/object/{scanned}#mode=depth", "fault": "/captures/cap_0123456789abcdefghjk",
-        "proposal": "/captures"}
+        "proposal": "/captures", "machines": "/machines", "home": "/"}
 
 
 CONTENT = {"captures": "#captures a", "jobs": "#jobs tbody a", "job": "#stages tbody tr", "capture": "#frames canvas",
            "light": "canvas.picture[data-ready]", "maps": "canvas.map", "asset": "canvas.scene[data-share='1']", "compare": "canvas.map",
            "frames": "canvas[data-ready]", "object": "figure canvas", "depth": "canvas.scene[data-share='1']", "fault": ".fault-page",
-           "proposal": ".proposal button"}
+           "proposal": ".proposal button", "machines": "#audit tbody tr", "home": ".card canvas"}
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_page_shows_the_sample(browser, server, shown, sky, tmp_path, scheme):
-    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 860}, color_scheme=scheme)
+def test_every_page_shows_the_sample(browser, server, shown, owl, solved, sky, tmp_path, scheme):
+    context = new_context(browser, base_url=server.url, color_scheme=scheme)
     page = context.new_page()
     for name, content in CONTENT.items():
+        page.set_viewport_size({"width": 1280, "height": 720 if name == "home" else 860})
         page.goto("about:blank")
         page.goto(shown[name])
         if name == "proposal":
@@ -52,6 +54,12 @@ def test_every_page_shows_the_sample(browser, server, shown, sky, tmp_path, sche
             page.get_by_label("Brightness of the environment").fill("-3")
             page.get_by_label("View transform").select_option("aces")
             page.get_by_role("button", name="Expose for this light").click()
+        if name == "machines":
+            page.locator("#workers").get_by_text("cpu").first.wait_for()
+            expect(page.get_by_text("Space left")).to_be_visible()
+        if name == "home":
+            for card in (owl.capture, solved.capture, sky):
+                await_picture(page, card)
         if name == "depth":
             page.locator("canvas.scene").scroll_into_view_if_needed()
         else:

@@ -15,8 +15,8 @@ from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
 from tests.scenes.video import write_video
 from tests.service.acquisition.test_acquire import posting
-from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, keep, new_context
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, expect, keep, new_context, opened_page
 from tests.service.server_process import serving
 from tests.service.twin_program import twin_running
 
@@ -47,25 +47,16 @@ def stage(folder: Path, *options: object, sample: bool = False, serve: tuple[obj
 
 @contextmanager
 def opened(browser, server, **options):
-    """The page, of which no script fails and nothing breaks the content security policy."""
-    context = new_context(browser, base_url=server.url, **{"viewport": {"width": 1280, "height": 900}, **options})
-    page, errors = context.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if "Content Security Policy" in message.text else None)
-    page.goto("/set")
-    page.get_by_role("heading", name="Set: the little dome").wait_for()
-    yield page
-    context.close()
-    assert errors == []
+    """The page of the stage."""
+    with opened_page(browser, base_url=server.url, viewport={"width": 1280, "height": 900}, **options) as page:
+        page.goto("/set")
+        page.get_by_role("heading", name="Set: the little dome").wait_for()
+        yield page
 
 
-def assert_accessible(page) -> None:
-    """Nothing serious in either scheme, where axe is installed, and all within the width of a phone, and of a window at 200 %."""
+def assert_accessible_where_axe_is(page) -> None:
     with suppress(pytest.skip.Exception):
-        assert violations_in_both_schemes(page) == []
-    for width in (390, 640, 1280):
-        page.set_viewport_size({"width": width, "height": 900})
-        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
+        assert_accessible(page, 390, 640, 1280)
 
 
 def test_only_programs_of_this_machine_reach_the_stage_and_bad_input_is_refused(tmp_path, relit):
@@ -100,15 +91,13 @@ def test_where_there_are_keys_an_administrator_alone_takes_captures_from_anywher
             for headers, status in (({}, 401), ({"Authorization": f"Bearer {keys['write']}"}, 403),
                                     ({"Authorization": f"Bearer {keys['admin']}", **elsewhere}, 204)):
                 assert client.post("/set/run", json=good, headers=headers).status_code == status
-        context = new_context(browser, base_url=server.url)
-        page = context.new_page()
-        page.goto("/set")
-        page.get_by_role("textbox", name="Key").fill(keys["admin"])
-        page.get_by_role("button", name="Use this key").click()
-        page.get_by_role("heading", name="Set: the little dome").wait_for()
-        page.locator("#now", has_text="1 of 1 pictures").wait_for()
-        page.locator("#picture[data-shown*='0001_dark'][src^='blob:']").wait_for()
-        context.close()
+        with opened_page(browser, base_url=server.url) as page:
+            page.goto("/set")
+            page.get_by_role("textbox", name="Key").fill(keys["admin"])
+            page.get_by_role("button", name="Use this key").click()
+            page.get_by_role("heading", name="Set: the little dome").wait_for()
+            page.locator("#now", has_text="1 of 1 pictures").wait_for()
+            page.locator("#picture[data-shown*='0001_dark'][src^='blob:']").wait_for()
 
 
 def test_from_the_first_click_to_an_asset(browser, tmp_path):
@@ -118,7 +107,7 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
             expect(page.locator("[data-step=chart]")).to_contain_text("The colours are those of the camera.")
             expect(page.get_by_role("button", name="Live view")).to_have_count(0)  # a watched folder has none
             expect(page.get_by_role("navigation").get_by_role("link", name="Set")).to_have_attribute("href", "/set")
-            assert_accessible(page)
+            assert_accessible_where_axe_is(page)
             page.get_by_label("Capture", exact=True).fill("owl")
             page.get_by_role("button", name="Colour chart: Add").press("Enter")
             expect(page.get_by_label("Plan")).to_have_value("dark,chart,olat")
@@ -129,7 +118,7 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
             expect(page.locator("[data-step=object]")).to_contain_text("✓")
             expect(page.locator("[data-step=dark]")).to_contain_text("1 of 1 picture")
             assert_turns(page)
-            assert_accessible(page)
+            assert_accessible_where_axe_is(page)
             page.evaluate("() => scrollTo(0, 0)")
             keep(page, "set", tmp_path)
             if PICTURES:  # to solve the sample takes minutes
@@ -171,14 +160,14 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         page.get_by_label("Plan").fill("dark,chart,olat")
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#prompt", has_text="put the colour chart in the place of the object").wait_for()
-        assert_accessible(page)
+        assert_accessible_where_axe_is(page)
         page.get_by_role("button", name="Done").click()
         mend = page.get_by_role("button", name="Take those with a fault again")
         mend.wait_for()
         expect(page.locator("#now")).to_contain_text(f"{LAMPS + 2} of {LAMPS + 2} pictures, 1 with a fault.")
         page.locator("#dome title", has_text="lamp 2: did not light: has 0").wait_for(state="attached")
         expect(page.locator("[data-step=object]")).to_contain_text("1 with a fault")
-        assert_accessible(page)
+        assert_accessible_where_axe_is(page)
         page.get_by_role("button", name="0006_light_004", exact=True).click()
         page.locator("#picture[data-shown*='0006_light_004']").wait_for()
         page.evaluate("() => scrollTo(0, 0)")
@@ -240,7 +229,7 @@ def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tm
             page.locator("#dome circle").filter(has_text=name).click()
         expect(lamps).to_have_value("3-4, 7")
         tracking.fill("2")
-        assert_accessible(page)
+        assert_accessible_where_axe_is(page)
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#dome circle").filter(has_text="lamp 0:").click()  # for the next capture, whatever is told of this one meanwhile
         page.locator("#now", has_text="6 of 6 pictures").wait_for()
@@ -328,7 +317,7 @@ def test_the_live_view_says_what_clips_and_ends_before_a_capture(browser, tmp_pa
         page.locator("#seen-words", has_text="50.0 % clipped").wait_for()
         page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
         expect(live).to_have_attribute("aria-pressed", "true")
-        assert_accessible(page)
+        assert_accessible_where_axe_is(page)
         page.get_by_label("Plan").fill("olat")
         page.get_by_role("button", name="Take the capture").click()
         page.locator("#now", has_text=f"{LAMPS} of {LAMPS} pictures").wait_for()

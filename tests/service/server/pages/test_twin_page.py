@@ -11,7 +11,7 @@ import pytest
 from service.play.play import play
 from service.requests.play import PlayRequest
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
-from tests.service.server.pages.conftest import SAMPLES, expect, keep, new_context
+from tests.service.server.pages.conftest import SAMPLES, expect, keep, opened_page
 from tests.service.twin_program import twin_running
 
 
@@ -27,9 +27,7 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
     player = threading.Thread(target=play, args=[PlayRequest(cues=cues, rig=rig, hold=1), stop])
     with twin_running(rig, SAMPLES / "owl", host, "--cache", tmp_path) as (program, address), ExitStack() as ending:
         ending.callback(stop.set)
-        context = new_context(browser, viewport={"width": 1000, "height": 640})
-        page, errors = context.new_page(), []
-        page.on("pageerror", lambda error: errors.append(str(error)))
+        page = ending.enter_context(opened_page(browser, viewport={"width": 1000, "height": 640}))
         page.goto(address)
         expect(page.locator("#state")).to_contain_text("Waiting")
         player.start()
@@ -50,5 +48,3 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         program.send_signal(signal.SIGINT)
         assert program.wait(timeout=120) == 0
         page.locator("#state", has_text="The twin has ended.").wait_for()
-        context.close()
-        assert errors == []

@@ -8,8 +8,8 @@ import OpenImageIO as oiio
 import pytest
 from scipy.ndimage import binary_erosion
 
-from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PAGE_BYTES, await_whole, count_bytes, done, expect, new_context, seen
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import PAGE_BYTES, WITHOUT_WEBGL, await_whole, count_bytes, done, expect, opened_page, seen
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -46,17 +46,14 @@ def exported(server, solved) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def opened(browser, server, exported):
-    """A page with the asset as glTF, which is opened once; an error of a script fails the module. axe is injected into it."""
-    page, errors = new_context(browser, base_url=server.url, viewport={"width": 640, "height": 480}, bypass_csp=True).new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.add_init_script(KEEP_CONTEXT)
-    loaded = count_bytes(page)
-    open_asset(page, exported["glb"])
-    seen(page, lambda: sum(loaded) > 1_000_000, "three.js is not loaded")
-    assert sum(loaded) < PAGE_BYTES
-    yield page
-    page.close()
-    assert errors == []
+    """A page with the asset as glTF, which is opened once; axe is injected into it."""
+    with opened_page(browser, base_url=server.url, viewport={"width": 640, "height": 480}, bypass_csp=True) as page:
+        page.add_init_script(KEEP_CONTEXT)
+        loaded = count_bytes(page)
+        open_asset(page, exported["glb"])
+        seen(page, lambda: sum(loaded) > 1_000_000, "three.js is not loaded")
+        assert sum(loaded) < PAGE_BYTES
+        yield page
 
 
 @pytest.fixture
@@ -268,8 +265,7 @@ def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor
 def test_a_job_without_an_asset_that_can_be_shown_is_said_and_without_webgl_the_file_is_offered(page, exported):
     page.goto(f"/asset/{exported['usda']}")
     page.get_by_text("this job has no asset.usdz or asset.glb").wait_for()
-    page.add_init_script("""const { getContext } = HTMLCanvasElement.prototype;
-      HTMLCanvasElement.prototype.getContext = function (kind) { return kind === "2d" ? getContext.call(this, kind) : null; }""")
+    page.add_init_script(WITHOUT_WEBGL)
     page.goto(f"/asset/{exported['glb']}")
     page.get_by_text("This browser has no WebGL2").wait_for()
     expect(page.get_by_role("link", name="Its job")).to_have_attribute("href", f"/jobs/{exported['glb']}")
@@ -307,9 +303,7 @@ def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp
 
 
 def test_no_violation(asset):
-    asset.set_viewport_size({"width": 390, "height": 844})
-    asset.wait_for_function("document.documentElement.scrollWidth <= 390")
-    assert violations_in_both_schemes(asset) == []
+    assert_accessible(asset, 390)
 
 
 def test_a_map_is_shown_without_light_and_a_link_has_the_camera(asset):

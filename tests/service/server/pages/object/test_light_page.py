@@ -12,7 +12,7 @@ from stage.colour.colour import rgb_matrix
 from stage.formats import exr
 from tests.reference.colour import srgb
 from tests.scenes.captures import edit_manifest, write_exr
-from tests.service.server.pages.conftest import SAMPLES, Solved, done, expect, new_context, seen
+from tests.service.server.pages.conftest import SAMPLES, WITHOUT_WEBGL, Solved, done, expect, seen
 from tests.service.server.pages.frames import assert_same, picture, rendered
 
 pytestmark = pytest.mark.long
@@ -161,15 +161,11 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
     assert_same(shown, srgb(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
 
-def test_without_webgl_it_is_said(browser, solved):
-    context = new_context(browser, base_url=solved.server.url)
-    context.add_init_script("HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, "
-                            "{ apply: (target, self, given) => given[0] === 'webgl2' ? null : Reflect.apply(target, self, given) });")
-    page = context.new_page()
+def test_without_webgl_it_is_said(page, solved):
+    page.add_init_script(WITHOUT_WEBGL)
     page.goto(solved.pages["light"])
     page.get_by_text("This browser has no WebGL2").wait_for(timeout=60_000)
     expect(page.get_by_role("button", name="Render")).to_be_visible()
-    context.close()
 
 
 @pytest.mark.parametrize("turn", ["0", "130"])

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import Solved, await_whole, done, expect, new_context, seen, spread_fingers
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import Solved, await_whole, done, expect, new_context, opened_page, seen, spread_fingers
 from tests.service.server.pages.frames import picture
 
 pytestmark = pytest.mark.long
@@ -275,13 +275,11 @@ def test_a_zoomed_picture_is_smooth_has_a_scale_bar_and_fills_the_screen(page, m
 
 
 def test_two_fingers_zoom_the_picture(browser, server, made):
-    context = new_context(browser, base_url=server.url, has_touch=True, viewport={"width": 390, "height": 800})
-    page = context.new_page()
-    page.goto(made.pages["light"])
-    made.wait_for_content(page, "light")
-    spread_fingers(page.locator("canvas.picture"))
-    page.wait_for_function("() => location.hash.includes('zoom=2')")
-    context.close()
+    with opened_page(browser, base_url=server.url, has_touch=True, viewport={"width": 390, "height": 800}) as page:
+        page.goto(made.pages["light"])
+        made.wait_for_content(page, "light")
+        spread_fingers(page.locator("canvas.picture"))
+        page.wait_for_function("() => location.hash.includes('zoom=2')")
 
 
 def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
@@ -337,13 +335,8 @@ def test_a_video_is_recorded_by_the_browser(page, made):
 
 
 @pytest.mark.parametrize("shown", ["light", "compare", "photographs", "maps", "3d"])
-def test_each_mode_has_no_violation_and_fits_a_phone(browser, server, made, shown):
-    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()
-    page.goto(f"{made.pages['object']}#mode={shown}")
-    page.locator(f"[data-shows='{shown}'] canvas").first.wait_for()
-    await_whole(page)
-    for width in (1280, 640, 390):
-        page.set_viewport_size({"width": width, "height": 844})
-        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
-    assert violations_in_both_schemes(page) == []
-    page.close()
+def test_each_mode_has_no_violation_and_fits_a_phone(open_to_axe, made, shown):
+    open_to_axe.goto(f"{made.pages['object']}#mode={shown}")
+    open_to_axe.locator(f"[data-shows='{shown}'] canvas").first.wait_for()
+    await_whole(open_to_axe)
+    assert_accessible(open_to_axe, 1280, 640, 390)

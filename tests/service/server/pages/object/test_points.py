@@ -10,8 +10,8 @@ from service.requests.jobs import DepthJob
 from service.server.database import jobs
 from stage.formats import exr
 from tests.service.server.api.job_calls import admitted
-from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import SAMPLES, await_whole, done, expect, new_context
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import SAMPLES, WITHOUT_WEBGL, await_whole, done, expect
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -86,23 +86,19 @@ def test_a_chosen_point_is_one_of_the_depth(cloud, server, depth, tmp_path):
 
 
 def test_without_webgl_the_maps_remain(page, depth):
-    page.add_init_script("""const real = HTMLCanvasElement.prototype.getContext;
-        HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
-            return kind === "webgl2" ? null : real.call(this, kind, ...more);
-        };""")
+    page.add_init_script(WITHOUT_WEBGL)
     page.goto(f"/maps/{depth[0]}")
     page.get_by_text("This browser has no WebGL2, which the points need").wait_for(timeout=LOADED_MS)
     expect(page.locator("canvas.map")).to_be_visible()
 
 
-def test_no_violation(browser, server, depth):
-    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
+def test_no_violation(open_to_axe, depth):
+    page = open_to_axe
+    page.set_viewport_size({"width": 390, "height": 844})
     page.goto(f"/maps/{depth[0]}")
     page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)
     await_whole(page)
-    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
-    assert violations(page) == []
-    page.close()
+    assert_accessible(page, 390)
 
 
 def test_other_scans_are_chosen_to_be_fused(page, server, depth):

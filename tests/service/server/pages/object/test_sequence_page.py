@@ -6,8 +6,8 @@ import pytest
 
 from tests.scenes.sequence import write_sequence
 from tests.service.server.api.test_measuring import files_of, upload
-from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import CONTENT_MS, await_whole, done, expect, new_context
+from tests.service.server.pages.axe import assert_accessible
+from tests.service.server.pages.conftest import CONTENT_MS, await_whole, done, expect
 
 pytestmark = pytest.mark.long
 
@@ -50,11 +50,9 @@ def test_the_maps_and_the_frames_of_each_step_are_looked_at(page, walk):
     page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)
 
 
-def test_the_choice_of_a_step_has_no_violation(browser, server, walk):
-    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
-    page.goto(f"/jobs/{walk[1]}")
-    page.get_by_role("link", name="Look at the maps").click()
-    page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
-    await_whole(page)
-    assert violations(page) == []
-    page.close()
+def test_the_choice_of_a_step_has_no_violation(open_to_axe, walk):
+    open_to_axe.goto(f"/jobs/{walk[1]}")
+    open_to_axe.get_by_role("link", name="Look at the maps").click()
+    open_to_axe.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
+    await_whole(open_to_axe)
+    assert_accessible(open_to_axe)
