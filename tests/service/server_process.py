@@ -61,6 +61,11 @@ def revoke(database: Database, key: str) -> bool:
     return database.transact(partial(keys.revoke, identifier=key.partition(".")[0]))
 
 
+def children_of(pid: int) -> list[int]:
+    """Processes that a process, or a thread of it, has started."""
+    return [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
+
+
 class Server:
     """A server that runs."""
 

@@ -32,9 +32,11 @@ def made_by(client: httpx2.Client, job: dict) -> set[str]:
 
 
 def refused(response: httpx2.Response, status: int, words: str) -> None:
+    """A problem with these words and, where the same request may succeed later, the seconds until then."""
     assert response.status_code == status, response.text
     assert response.headers["Content-Type"] == "application/problem+json"
     assert words in response.json()["detail"], response.json()["detail"]
+    assert (int(response.headers.get("Retry-After", 0)) >= 1) == (status in (423, 429, 503, 507))
 
 
 def has_made(client: httpx2.Client, job: dict, count: int) -> None:

@@ -97,17 +97,6 @@ def test_a_stream_that_cannot_be_is_refused(client, solved):
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
-def test_streams_end_with_the_service(tmp_path: Path):
-    with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
-        with server.database() as database:
-            job = queue(database, "default")
-        with (client.stream("GET", f"/v1/jobs/{job}/events") as one, client.stream("GET", "/v1/events") as whole):
-            found = told(one.iter_lines()), told(whole.iter_lines())
-            assert [next(stream)["data"]["id"] for stream in found] == [job, job]
-            server.process.terminate()
-            assert [list(stream) for stream in found] == [[], []]  # they end, and do not break off
-        assert server.process.wait(WAIT_S) == 0
-
 
 def test_streams_stay_open_while_postgresql_restarts(tmp_path: Path, server_postgres):
     with (serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server,

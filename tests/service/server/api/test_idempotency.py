@@ -9,7 +9,7 @@ from service.requests.base.identifiers import new_id
 from service.requests.keys import Scope
 from service.server.database import idempotency, intakes
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import accepted
+from tests.service.server.api.job_calls import accepted, refused
 from tests.service.waiting import at_once
 
 PROJECT = "alder"
@@ -43,8 +43,7 @@ def test_the_same_request_again_is_the_same_job_and_another_is_refused(client, c
     without = client.post("/v1/jobs", json={"kind": "solve", "capture": capture})
     assert len({response.json()["id"] for response in (first, other, without)}) == 3
     for other in ({"kind": "solve", "capture": capture, "priority": 51}, {"kind": "depth", "capture": capture}):
-        response = client.post("/v1/jobs", json=other, headers=token)
-        assert response.status_code == 422 and "came with another request before" in response.json()["detail"]
+        refused(client.post("/v1/jobs", json=other, headers=token), 422, "came with another request before")
     assert client.post("/v1/captures", json={"name": "owl"}, headers=token).status_code == 422
 
 

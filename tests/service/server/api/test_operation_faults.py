@@ -4,7 +4,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -15,8 +14,9 @@ import pytest
 
 from service.server.database import jobs, workers
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import accepted, admitted, submit
-from tests.service.server_process import Server, environment_with, serving
+from tests.service.server.api.job_calls import accepted, admitted, refused, submit
+from tests.service.server.api.test_events import told
+from tests.service.server_process import Server, children_of, environment_with, serving
 from tests.service.waiting import PATIENCE_S, at_once, until
 
 pytestmark = pytest.mark.long
@@ -30,9 +30,7 @@ def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):
             server.client() as client:
         assert client.get("/v1/jobs").status_code == 200
         server_postgres.stop("immediate")
-        refused = client.get("/v1/jobs")
-        assert (refused.status_code, refused.headers["Content-Type"]) == (503, "application/problem+json")
-        assert refused.headers["Retry-After"] and "database does not answer" in refused.json()["detail"]
+        refused(client.get("/v1/jobs"), 503, "database does not answer")
         until(lambda: "the database does not answer" in client.get("/readyz").json()["detail"], "it does not say so")
         assert client.get("/healthz").status_code == 200 and "relit_database_up 0.0" in client.get("/metrics").text
         server_postgres.start()
@@ -67,32 +65,27 @@ def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
 
 
 def test_the_service_drains_and_ends_clean(busy):
-    """While the worker drains, the service answers on and is not ready; streams end as streams do; the job waits for the next worker."""
+    """While the worker drains, the service answers on and is not ready; streams end as streams do; the job, whose step does not end, waits
+    for the next worker."""
     server, client, job = busy
-    lines: list[str] = []
-
-    def listen() -> None:
-        with server.client() as other, other.stream("GET", f"/v1/jobs/{job}/events") as stream:
-            lines.extend(stream.iter_lines())
-        lines.append("END")
-
-    listener = threading.Thread(target=listen)
-    listener.start()
-    until(lambda: lines, "no event")
-    server.process.send_signal(signal.SIGTERM)
-    response = until(lambda: (found := client.get("/readyz")).status_code == 503 and found, "still ready")
-    assert response.json()["detail"] == "the service is ending" and response.headers["Retry-After"]
-    assert client.get("/healthz").status_code == 200
-    assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
+    with server.client() as other, other.stream("GET", f"/v1/jobs/{job}/events") as one, other.stream("GET", "/v1/events") as whole:
+        found = told(one.iter_lines()), told(whole.iter_lines())
+        assert [next(stream)["data"]["id"] for stream in found] == [job, job]
+        server.process.send_signal(signal.SIGTERM)
+        response = until(lambda: (answer := client.get("/readyz")).status_code == 503 and answer, "still ready")
+        refused(response, 503, "the service is ending")
+        assert client.get("/healthz").status_code == 200
+        assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
+        for stream in found:
+            list(stream)  # it ends, and does not break off
     assert server.process.wait(PATIENCE_S) == 0
-    listener.join(PATIENCE_S)
-    assert lines[-1] == "END"
     text = server.log.read_text()
-    assert "interrupted" not in text and "Traceback" not in text
+    assert "interrupted" not in text and "Traceback" not in text and "step is given up" in text
     assert server.lines()[-1]["event"] == "service ended"
     assert not list((server.data / "locks").glob("*.lock"))
     with server.database() as database:
-        assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
+        row = jobs.find(database, job)
+        assert (row["state"], row["worker"], row["lost"]) == ("queued", None, 0) and workers.seen_lately(database) == []
 
 
 def test_asked_twice_it_ends_at_once(busy):
@@ -109,9 +102,6 @@ def test_asked_twice_it_ends_at_once(busy):
     assert "step is given up" not in server.log.read_text()  # which comes after DRAIN_S
     until(lambda: not any(alive(child) for child in children), "a worker lives on")
 
-
-def children_of(pid: int) -> list[int]:
-    return [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
 
 
 def alive(pid: int) -> bool:

@@ -10,6 +10,7 @@ from service.requests.base.identifiers import new_id
 from service.requests.keys import Scope
 from service.server.base.settings import Settings
 from tests.service.server.api.asgi import app_of
+from tests.service.server.api.job_calls import refused
 from tests.service.server_process import new_key
 
 KINDS = {"captures": "owl", "environments": "environment.exr"}
@@ -60,5 +61,4 @@ def test_a_service_without_the_sample_says_so(of, monkeypatch):
 
     monkeypatch.setattr("service.server.api.intakes.sample_folder", absent)
     for kind in KINDS:
-        answer = of("larch").post(f"/v1/samples/{kind}")
-        assert answer.status_code == 404 and "without the sample capture" in answer.json()["detail"]
+        refused(of("larch").post(f"/v1/samples/{kind}"), 404, "without the sample capture")

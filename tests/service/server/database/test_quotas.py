@@ -113,12 +113,6 @@ def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
     assert taken(database, work) == 3
 
 
-@pytest.mark.parametrize("given", ["larch", "larch:max_project_jobs", "larch:max_frames=1", "larch:max_project_jobs=-1",
-                                   "../x:max_project_jobs=1"])
-def test_quotas_that_cannot_be(given):
-    with pytest.raises(ValueError, match="give PROJECT:QUOTA=NUMBER"):
-        Settings(project_quotas=given)
-
 
 CALLER = Caller("larch", Scope.WRITE, "key_0123456789abcdefghjk")
 

@@ -69,30 +69,6 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         made.made_whole(job, undisturbed)
 
 
-def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
-    with harness(tmp_path, drain_s=1) as made:
-        worker = made.start("hang")
-        made.ready(1)
-        job = made.begin(undisturbed)
-        made.holder(job)
-        worker.send_signal(signal.SIGTERM)
-        assert worker.wait(30) == 0
-        row = made.row(job)
-        assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
-
-
-def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
-    with harness(tmp_path) as made:
-        worker = made.start("slow")
-        made.ready(1)
-        job = made.begin(undisturbed, chunk_frames=6)
-        frames_there(made, job, 1)
-        os.kill(worker.pid, signal.SIGKILL)
-        made.until(lambda: made.row(job)["state"] == jobs.QUEUED, "handed back")
-        row = made.row(job)
-        assert row["lost"] == 0 and row["finished_steps"][0] == "frames 1-6"
-        made.until(lambda: any(event["event"] == "worker ended" for event in made.events()), "ended")
-
 
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
     with harness(tmp_path, max_lost=1, takeover_s=0.2) as made:

@@ -10,7 +10,7 @@ from service.server.database import jobs
 from tests.service.server.api.job_calls import admitted, submit
 from tests.service.server.jobs.harness import digests
 from tests.service.server.jobs.test_faults import fill, small_disk  # noqa: F401  (a fixture)
-from tests.service.server_process import Server, serving
+from tests.service.server_process import Server, children_of, serving
 from tests.service.waiting import until
 
 pytestmark = pytest.mark.long
@@ -35,15 +35,10 @@ def frames_there(server: Server, job: str, count: int) -> None:
     until(lambda: results(server, job).is_dir() and len(list(results(server, job).glob("frame.*"))) >= count, f"{count} frames")
 
 
-def children(pid: int) -> list[int]:
-    """Of all its threads."""
-    return [int(child) for thread in Path(f"/proc/{pid}/task").iterdir() for child in (thread / "children").read_text().split()]
-
 
 def assert_workers_are_spawned(server: Server) -> None:
     """Check that the API has no Warp, and that its worker, which has done a job, is no fork of it."""
-    processes = children(server.process.pid)
-    commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode() for pid in processes}
+    commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode() for pid in children_of(server.process.pid)}
     for command in commands.values():  # a forked child would have its parent's
         assert "multiprocessing.spawn" in command or "multiprocessing.resource_tracker" in command
     [worker] = [pid for pid, command in commands.items() if "multiprocessing.spawn" in command]
@@ -52,6 +47,7 @@ def assert_workers_are_spawned(server: Server) -> None:
 
 
 def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
+    """A worker ends after its step with the process that looks after it, and gives its job back."""
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         job = begin(server, client, undisturbed)
