@@ -13,7 +13,7 @@ from service.errors import RequestError
 from service.requests import states
 from service.requests.answers import IntakePage, IntakeView
 from service.requests.base.annotations import AnnotationPage, AnnotationView, NewAnnotation, page_of, view_of
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId, CaptureId, new_id, pattern
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId, CaptureId, pattern
 from service.requests.demo import sample_folder
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
@@ -231,10 +231,8 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Fi
     require_space(service, FOR_WORK)
 
     def make(connection: sa.Connection) -> str:
-        identifier = new_id(prefix)
         quotas.require(connection, service.settings, quotas.CAPTURES, caller.project, 1)
-        intakes.insert(connection, identifier=identifier, project=caller.project, kind=prefix, name=name,
-                       folder=None if folder is None else str(folder))
+        identifier = intakes.insert(connection, project=caller.project, kind=prefix, name=name, folder=folder)
         if folder is not None:
             submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
         audit.record(connection, caller, "intake.create" if folder is None else "intake.register", identifier)

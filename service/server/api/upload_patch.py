@@ -192,10 +192,14 @@ class UploadPatch:
 
     def _complete(self) -> None:
         row, service = self._row, self._service
-        if row["sha256"] is not None and self._sha256() != row["sha256"]:
-            self._part.cut(0)
-            self._save(0)
-            raise ApiError("checksum-mismatch", f"{shown(row['path'])}: has another sha256 than was said: all its bytes are dropped")
+        if row["sha256"] is not None:
+            if self._whole is None:
+                self._whole = hashlib.sha256()
+                self._part.digest_into(self._whole)
+            if self._whole.hexdigest() != row["sha256"]:
+                self._part.cut(0)
+                self._save(0)
+                raise ApiError("checksum-mismatch", f"{shown(row['path'])}: has another sha256 than was said: all its bytes are dropped")
         self._still_there()
         prefix = layout.intake(row["project"], row["intake"])
         service.storage.put(self._part.whole(), prefix, row["path"])
@@ -205,12 +209,6 @@ class UploadPatch:
             self._gone()
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
-    def _sha256(self) -> str:
-        whole = self._whole
-        if whole is None:
-            whole = hashlib.sha256()
-            self._part.digest_into(whole)
-        return str(whole.hexdigest())
 
     def _still_there(self) -> Row:
         row = uploads.find(self._service.database, self._row["id"], self._row["project"])

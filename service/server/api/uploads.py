@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 
 from service.requests.answers import FilePage, FileView
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, UploadId, new_id, pattern
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UploadId, pattern
 from service.server.api import tus
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
@@ -157,12 +157,15 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
             uploads.remove(connection, before["id"])  # its part file, which nobody can continue, goes with the next housekeeping
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
-        _require_room(service, connection, intake)
+        count, most = uploads.count(connection, intake), settings.max_capture_files
+        if intake.startswith(ENVIRONMENT) and count > 0:
+            raise ApiError("conflict", f"{intake} has its file already: delete that, or give its path to replace it")
+        if count >= most:
+            raise ApiError("too-large", f"{intake} has {count} files, and more than {most} are not taken")
         quotas.require(connection, service.settings, quotas.BYTES, caller.project, length)
-        identifier = new_id(UPLOAD)
         try:
-            uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,
-                           sha256=given.sha256)
+            identifier = uploads.insert(connection, project=caller.project, intake=intake, path=given.path, length=length,
+                                        sha256=given.sha256)
         except uploads.PathTaken as error:
             raise ApiError("conflict", str(error)) from None
         audit.record(connection, caller, "upload.create", identifier)
@@ -198,13 +201,6 @@ def _hold(service: Service, caller: Caller, connection: sa.Connection, intake: s
     state = "registered" if row["folder"] is not None else row["state"]
     raise ApiError("conflict", f"{intake} is {state}: its files do not change any more")
 
-
-def _require_room(service: Service, connection: sa.Connection, intake: str) -> None:
-    count, most = uploads.count(connection, intake), service.settings.max_capture_files
-    if intake.startswith(ENVIRONMENT) and count > 0:
-        raise ApiError("conflict", f"{intake} has its file already: delete that, or give its path to replace it")
-    if count >= most:
-        raise ApiError("too-large", f"{intake} has {count} files, and more than {most} are not taken")
 
 
 def _row(service: Service, caller: Caller, upload: str) -> Row:

@@ -5,6 +5,7 @@ receiving (an upload) → checking → ready | refused. The files of an intake d
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
@@ -21,10 +22,13 @@ PROPOSAL = "proposal"
 """The fact of a capture that has no manifest: how its files can be imported."""
 
 
-def insert(connection: sa.Connection, *, identifier: str, project: str, kind: str, name: str, folder: str | None) -> None:
-    """Insert an intake: receiving an upload if `folder` is None, else registered and about to be checked."""
-    connection.execute(intakes.insert().values(id=identifier, project=project, kind=kind, name=name, folder=folder, created_at=time.time(),
-                                               state=RECEIVING if folder is None else CHECKING))
+def insert(connection: sa.Connection, *, project: str, kind: str, name: str, folder: Path | None = None) -> str:
+    """Insert an intake, and return its identifier: receiving an upload if `folder` is None, else registered and about to be checked."""
+    identifier = new_id(kind)
+    connection.execute(intakes.insert().values(
+        id=identifier, project=project, kind=kind, name=name, folder=None if folder is None else str(folder), created_at=time.time(),
+        state=RECEIVING if folder is None else CHECKING))
+    return identifier
 
 
 def find(database: Database, identifier: str, project: str) -> sa.RowMapping | None:

@@ -45,10 +45,11 @@ REPEATED = 10
 """Number of times that `max_lost` workers may die one after the other in stages that earlier workers came through."""
 
 
-def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
-           inputs: Iterable[str], trace: str | None = None, finished: str | None = None) -> str:
+def insert(connection: sa.Connection, *, project: str, request: JobRequest, key: str | None = None, chunk_frames: int = 1,
+           inputs: Iterable[str] = (), trace: str | None = None, finished: str | None = None) -> str:
     """Insert a new job, which reads `inputs`, in the caller's transaction, and return its identifier.
 
+    `key` is that of whoever submits it; None: the service, or anybody. `chunk_frames` is the number of frames of a step of a relight.
     `finished` is the identifier of a job whose results exist already: it is inserted as one that has succeeded.
     """
     identifier, now = finished or new_id(JOB), time.time()

@@ -9,6 +9,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.requests.base.identifiers import UPLOAD, new_id
 from service.server.base.safe_names import folded, folders_of, shown
 from service.server.database.engine import Database
 from service.server.database.tables import uploads
@@ -23,21 +24,20 @@ class PathTaken(Exception):
     """Another file has the path, or one that some file systems take for the same; the message is one sentence."""
 
 
-def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
-    """Insert an upload without bytes; the caller has locked the intake."""
-    _insert(connection, id=identifier, project=project, intake=intake, path=path, length=length, received=0, sha256=sha256, done=False)
+def insert(connection: sa.Connection, *, project: str, intake: str, path: str, length: int, sha256: str | None = None,
+           made: bool = False) -> str:
+    """Insert an upload without bytes, and return its identifier; the caller has locked the intake.
 
-
-def insert_made(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int) -> None:
-    """Insert a file that the service has made and put into the storage, in place of another of its path; the caller has locked the
-    intake."""
-    connection.execute(uploads.delete().where(uploads.c.intake == intake, uploads.c.path == path))
-    _insert(connection, id=identifier, project=project, intake=intake, path=path, length=length, received=length, done=True)
-
-
-def _insert(connection: sa.Connection, *, intake: str, path: str, **values: Any) -> None:
+    `made`: the service has made the file and put it into the storage, in place of another of this path.
+    """
+    if made:
+        connection.execute(uploads.delete().where(uploads.c.intake == intake, uploads.c.path == path))
     _require_free(connection, intake, path)
-    connection.execute(uploads.insert().values(intake=intake, path=path, folded=folded(path), touched_at=time.time(), **values))
+    identifier = new_id(UPLOAD)
+    connection.execute(uploads.insert().values(
+        id=identifier, project=project, intake=intake, path=path, folded=folded(path), length=length, sha256=sha256, touched_at=time.time(),
+        received=length if made else 0, done=made))
+    return identifier
 
 
 def find(database: Database, identifier: str, project: str) -> Row | None:

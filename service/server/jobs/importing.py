@@ -14,7 +14,6 @@ import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.requests import jobs
-from service.requests.base.identifiers import UPLOAD, new_id
 from service.requests.states import CHECKING
 from service.server.base.safe_names import folded
 from service.server.database import intakes, quotas, uploads
@@ -65,8 +64,7 @@ def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
         def record(connection: sa.Connection) -> None:
             allow(connection)
             for name, length in made.items():
-                uploads.insert_made(connection, identifier=new_id(UPLOAD), project=job.project, intake=request.intake, path=name,
-                                    length=length)
+                uploads.insert(connection, project=job.project, intake=request.intake, path=name, length=length, made=True)
 
         context.database.transact(allow)  # asked again where it counts
         place = layout.intake(job.project, request.intake)

@@ -75,11 +75,9 @@ class JobQueue:
         self._database = database
         self._client = DBOSClient(system_database_engine=database.engine, serializer=SERIALIZER, lazy=True, retry_connection_errors=False)
 
-    def submit(self, connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
-               inputs: list[str], trace: str | None = None) -> str:
+    def submit(self, connection: sa.Connection, *, project: str, request: JobRequest, **more: Any) -> str:
         """Record a new job and queue it in the caller's transaction; the arguments are those of `jobs.insert`."""
-        job = jobs.insert(connection, project=project, key=key, request=request, chunk_frames=chunk_frames, inputs=inputs,
-                          trace=trace)
+        job = jobs.insert(connection, project=project, request=request, **more)
         self.enqueue(connection, job, 1, request, request.priority, project)
         return job
 

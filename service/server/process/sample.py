@@ -64,17 +64,14 @@ def _add(database: Database, storage: Storage, request: JobRequest, files: Seque
         (folder / f".{file.name}").rename(folder / file.name)
     storage.publish(prefix)
     with database.begin() as connection:
-        return jobs.insert(connection, project=DEFAULT_PROJECT, key=None, request=request, chunk_frames=1, inputs=inputs,
-                           finished=identifier)
+        return jobs.insert(connection, project=DEFAULT_PROJECT, request=request, inputs=inputs, finished=identifier)
 
 
 def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> str:
     for row in intakes.latest(database, DEFAULT_PROJECT, kind, limit=500):
         if row["folder"] == str(path) and row["state"] != REFUSED:
             return str(row["id"])
-    identifier = new_id(kind)
     with database.begin() as connection:
-        intakes.insert(connection, identifier=identifier, project=DEFAULT_PROJECT, kind=kind, name=path.name, folder=str(path))
-        queue.submit(connection, project=DEFAULT_PROJECT, key=None, request=CheckJob(kind="check", intake=identifier), chunk_frames=1,
-                     inputs=[identifier])
+        identifier = intakes.insert(connection, project=DEFAULT_PROJECT, kind=kind, name=path.name, folder=path)
+        queue.submit(connection, project=DEFAULT_PROJECT, request=CheckJob(kind="check", intake=identifier), inputs=[identifier])
     return identifier

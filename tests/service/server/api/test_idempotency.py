@@ -97,9 +97,7 @@ def test_a_token_that_cannot_be_is_refused(client, token):
 @pytest.mark.long
 def test_at_once_on_either_database(database):
     def make(connection) -> str:
-        identifier = new_id("cap")
-        intakes.insert(connection, identifier=identifier, project=PROJECT, kind="cap", name="x", folder=None)
-        return identifier
+        return intakes.insert(connection, project=PROJECT, kind="cap", name="x")
 
     made = at_once(AT_ONCE, lambda _: idempotency.create_once(database, PROJECT, "token", ["x"], make))
     assert [row["id"] for row in intakes.latest(database, PROJECT, "cap", limit=10)] == list(set(made))

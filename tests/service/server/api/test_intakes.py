@@ -81,15 +81,11 @@ def test_what_has_no_file_is_refused_and_its_check_begins_again_by_another_valid
 @pytest.mark.parametrize("end", ["cancelled", "lost"])
 def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     """Cancelled, or the death of worker after worker: what it was to look at is refused, and does not check for ever."""
-    database, capture = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), new_id(CAPTURE)
+    database = connect(f"sqlite:///{tmp_path / 'test.sqlite'}")
     upgrade(database)
-
-    def begin(connection) -> str:
-        intakes.insert(connection, identifier=capture, project="p", kind=CAPTURE, name="test", folder="/somewhere")
-        return jobs.insert(connection, project="p", key=None, request=CheckJob(kind="check", intake=capture), chunk_frames=1,
-                           inputs=[capture])
-
-    job = database.transact(begin)
+    with database.begin() as connection:
+        capture = intakes.insert(connection, project="p", kind=CAPTURE, name="test", folder=tmp_path)
+        job = jobs.insert(connection, project="p", request=CheckJob(kind="check", intake=capture), inputs=[capture])
     if end == "cancelled":
         assert database.transact(lambda connection: jobs.cancel(connection, job))
     else:

@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.requests.base.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE
 from service.server.api import context, limits
 from service.server.api.app import create_app
 from service.server.api.limits import CREATION_COST, RateLimiter
@@ -189,9 +189,8 @@ def test_without_space_nothing_new_is_taken_and_the_service_says_so(tmp_path):
     """What is there can be read on."""
     with app_of(Settings(data=tmp_path, anonymous=True, roots=str(SAMPLES), min_free_bytes=1 << 60)) as app, \
             TestClient(app, base_url="http://localhost") as client:
-        there = new_id(CAPTURE)
-        app.state.service.database.transact(lambda connection: intakes.insert(
-            connection, identifier=there, project="default", kind=CAPTURE, name="test", folder=None))
+        there = app.state.service.database.transact(lambda connection: intakes.insert(
+            connection, project="default", kind=CAPTURE, name="test"))
         for path, body in (("/v1/captures", {"name": "x"}), ("/v1/captures", {"name": "x", "folder": str(SAMPLES / "owl")}),
                            ("/v1/environments", {"name": "x"})):
             refused(client.post(path, json=body), 507, "no space left")

@@ -24,8 +24,7 @@ def made(server, model: type[DepthJob | SolveJob], kind: str) -> tuple[str, Path
     """A job that has succeeded, and the folder of its results."""
     job, request = new_id(JOB), model(kind=kind, capture=new_id(CAPTURE))
     with server.database() as database:
-        database.transact(lambda connection: jobs.insert(
-            connection, project="default", key=None, request=request, chunk_frames=8, inputs=[], finished=job))
+        database.transact(lambda connection: jobs.insert(connection, project="default", request=request, finished=job))
     return job, server.data / layout.results("default", job)
 
 

@@ -45,7 +45,7 @@ def quick(monkeypatch):
 
 def queue(database: Database, project: str = PROJECT) -> str:
     return database.transact(lambda connection: jobs.insert(
-        connection, project=project, key=None, request=SolveJob(kind="solve", capture=new_id("cap")), chunk_frames=1, inputs=[]))
+        connection, project=project, request=SolveJob(kind="solve", capture=new_id("cap"))))
 
 
 def put(database: Database, job: str, **values) -> None:

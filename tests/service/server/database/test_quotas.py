@@ -7,7 +7,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
 from service.errors import RequestError
-from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob, SolveJob
 from service.requests.keys import Scope
 from service.server.base.settings import Settings
@@ -18,9 +18,7 @@ from tests.service.waiting import at_once
 
 
 def capture(connection, project: str) -> str:
-    made = new_id(CAPTURE)
-    intakes.insert(connection, identifier=made, project=project, kind=CAPTURE, name="x", folder=None)
-    return made
+    return intakes.insert(connection, project=project, kind=CAPTURE, name="x")
 
 
 def allowed(database: Database, quota: str, project: str, more: int, **settings: object) -> bool:
@@ -34,8 +32,8 @@ def allowed(database: Database, quota: str, project: str, more: int, **settings:
 def test_bytes_are_those_of_uploads_and_results(database):
     def work(connection):
         place = capture(connection, "larch")
-        uploads.insert(connection, identifier=new_id(UPLOAD), project="larch", intake=place, path="a", length=60, sha256=None)
-        job = jobs.insert(connection, project="larch", key=None, request=SolveJob(kind="solve", capture=place), chunk_frames=1, inputs=[])
+        uploads.insert(connection, project="larch", intake=place, path="a", length=60)
+        job = jobs.insert(connection, project="larch", request=SolveJob(kind="solve", capture=place))
         connection.execute(tables.jobs.update().where(tables.jobs.c.id == job).values(result_bytes=30))
 
     database.transact(work)
@@ -48,10 +46,8 @@ def test_bytes_are_those_of_uploads_and_results(database):
 def test_checks_and_ended_jobs_do_not_count(database):
     def work(connection):
         for request in (SolveJob(kind="solve", capture=new_id(CAPTURE)), CheckJob(kind="check", intake=new_id(CAPTURE))):
-            jobs.insert(connection, project="larch", key=None, request=request, chunk_frames=1, inputs=[])
-        ended = jobs.insert(connection, project="larch", key=None, request=SolveJob(kind="solve", capture=new_id(CAPTURE)), chunk_frames=1,
-                            inputs=[])
-        jobs.cancel(connection, ended)
+            jobs.insert(connection, project="larch", request=request)
+        jobs.cancel(connection, jobs.insert(connection, project="larch", request=SolveJob(kind="solve", capture=new_id(CAPTURE))))
 
     database.transact(work)
     assert allowed(database, quotas.JOBS, "larch", 1, max_project_jobs=2)
@@ -104,8 +100,7 @@ def test_several_at_once_do_not_all_take_the_last_place(database):
 def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
     """On PostgreSQL a transaction does not see what others have not ended; `submission.require_queue` counts so."""
     def work(connection):
-        job = jobs.insert(connection, project="larch", key="key_a", request=SolveJob(kind="solve", capture=new_id(CAPTURE)),
-                          chunk_frames=1, inputs=[])
+        job = jobs.insert(connection, project="larch", key="key_a", request=SolveJob(kind="solve", capture=new_id(CAPTURE)))
         if jobs.count_queued(connection, "larch", "key_a") > 3:
             raise RequestError("too many")
         return job

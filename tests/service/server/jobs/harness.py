@@ -86,16 +86,14 @@ class Harness:
 
     def register(self, path: Path, kind: str, **facts: int) -> str:
         """A capture or an environment that needs no check, of which one found these facts."""
-        identifier = new_id(kind)
-        self.database.transact(lambda connection: intakes.insert(
-            connection, identifier=identifier, project=PROJECT, kind={CAPTURE: "capture", ENVIRONMENT: "environment"}[kind],
-            name=path.name, folder=str(path.resolve())))
+        identifier = self.database.transact(lambda connection: intakes.insert(
+            connection, project=PROJECT, kind=kind, name=path.name, folder=path.resolve()))
         intakes.accept(self.database, identifier, facts)
         return identifier
 
     def submit(self, request: JobRequest, *, chunk_frames: int) -> str:
         return self.database.transact(lambda connection: self.queue.submit(
-            connection, project=PROJECT, key=None, request=request, chunk_frames=chunk_frames, inputs=[]))
+            connection, project=PROJECT, request=request, chunk_frames=chunk_frames))
 
     def relight(self, capture: str, environment: str, frames: int, *, chunk_frames: int) -> str:
         return self.submit(RelightJob(kind="relight", capture=capture, environment=environment,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from service.errors import RequestError
-from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE
 from service.requests.base.import_choices import ImportChoices
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, uploads
@@ -26,18 +26,13 @@ CHOICES = ImportChoices(layout="olat", options={"axes": "right,up,towards", "sen
 @pytest.fixture
 def uploaded(idle_harness, tmp_path):
     """A capture whose photographs were uploaded, and which is about to be imported."""
-    identifier, folder = new_id(CAPTURE), write_photographs(tmp_path / "photos")
-    storage = open_storage(idle_harness.settings)
+    folder, storage = write_photographs(tmp_path / "photos"), open_storage(idle_harness.settings)
     names = sorted(path.name for path in folder.iterdir())
-
-    def record(connection):
-        intakes.insert(connection, identifier=identifier, project=PROJECT, kind="capture", name="dropped", folder=None)
+    with idle_harness.database.begin() as connection:
+        identifier = intakes.insert(connection, project=PROJECT, kind=CAPTURE, name="dropped")
         for name in names:
-            uploads.insert_made(connection, identifier=new_id(UPLOAD), project=PROJECT, intake=identifier, path=name,
-                                length=(folder / name).stat().st_size)
+            uploads.insert(connection, project=PROJECT, intake=identifier, path=name, length=(folder / name).stat().st_size, made=True)
         intakes.begin_check(connection, identifier)
-
-    idle_harness.database.transact(record)
     for name in names:
         storage.put(folder / name, layout.intake(PROJECT, identifier), name)
     return identifier, names
@@ -119,8 +114,8 @@ def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_h
     identifier, names = uploaded
     own, length = tmp_path / "own.json", 5
     own.write_text("{" * length)
-    idle_harness.database.transact(lambda connection: uploads.insert_made(
-        connection, identifier=new_id(UPLOAD), project=PROJECT, intake=identifier, path="capture.json", length=length))
+    idle_harness.database.transact(lambda connection: uploads.insert(
+        connection, project=PROJECT, intake=identifier, path="capture.json", length=length, made=True))
     open_storage(idle_harness.settings).put(own, layout.intake(PROJECT, identifier), "capture.json")
     with pytest.raises(RequestError, match=r"^capture\.json: was uploaded and stays as it is"):
         run(idle_harness, identifier, max_project_pixels=1)
@@ -150,7 +145,7 @@ def test_an_import_that_fails_in_any_way_takes_what_it_made_away(idle_harness, u
         raise RuntimeError
 
     with monkeypatch.context() as patched:
-        patched.setattr(uploads, "insert_made", broken)
+        patched.setattr(uploads, "insert", broken)
         with pytest.raises(RuntimeError):
             run(idle_harness, identifier)
     assert stored(idle_harness, identifier) == (names,) * 2

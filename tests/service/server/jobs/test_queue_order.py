@@ -23,8 +23,7 @@ def test_workers_take_jobs_by_priority_and_time_and_projects_take_turns(tmp_path
         def submit(project, priority=0):
             time.sleep(0.002)  # DBOS orders jobs by the millisecond
             request = SolveJob(kind="solve", capture=new_id(CAPTURE), priority=priority)  # of no capture: it fails at once
-            return made.database.transact(lambda connection: made.queue.submit(
-                connection, project=project, key=None, request=request, chunk_frames=1, inputs=[]))
+            return made.database.transact(lambda connection: made.queue.submit(connection, project=project, request=request))
 
         urgent = [submit("larch", 100) for _ in range(MANY)]
         ordinary = submit("willow")

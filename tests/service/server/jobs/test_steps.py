@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.base.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE
 from service.requests.jobs import CheckJob, SolveJob
 from service.requests.light.frame_range import numbered
 from service.requests.solve import SolveOptions
@@ -87,9 +87,8 @@ def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness
     silent = SimpleNamespace(stage=lambda *_: None, advance=lambda *_: None)  # a check advances before it names a stage
 
     def checked(most):
-        identifier = new_id(CAPTURE)
-        idle_harness.database.transact(lambda connection: intakes.insert(
-            connection, identifier=identifier, project=PROJECT, kind="capture", name="x", folder=str(capture)))
+        identifier = idle_harness.database.transact(lambda connection: intakes.insert(
+            connection, project=PROJECT, kind=CAPTURE, name="x", folder=capture))
         only_step(idle_harness, CheckJob(kind="check", intake=identifier), (capture.parent,),
                   max_project_pixels=most).run(silent)
         return intakes.find(idle_harness.database, identifier, PROJECT)["state"]

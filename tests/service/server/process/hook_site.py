@@ -30,8 +30,7 @@ class Site:
 
     def queued(self, project: str = PROJECT) -> str:
         return self.database.transact(lambda connection: self.house.queue.submit(
-            connection, project=project, key=None, request=SolveJob(kind="solve", capture=new_id(CAPTURE), name="owl"), chunk_frames=8,
-            inputs=[]))
+            connection, project=project, request=SolveJob(kind="solve", capture=new_id(CAPTURE), name="owl")))
 
     def ended(self, state: str = jobs.SUCCEEDED, project: str = PROJECT) -> str:
         job = self.queued(project)

@@ -38,15 +38,11 @@ class House:
         self.keeper.round()
 
     def capture(self, kind: str = CAPTURE) -> str:
-        made = new_id(kind)
-        self.database.transact(lambda connection: intakes.insert(
-            connection, identifier=made, project=PROJECT, kind=kind, name="x", folder=None))
-        return made
+        return self.database.transact(lambda connection: intakes.insert(connection, project=PROJECT, kind=kind, name="x"))
 
     def job(self, state: str = jobs.SUCCEEDED, *, inputs: tuple[str, ...] = (), request=None) -> str:
         request = request or SolveJob(kind="solve", capture=inputs[0] if inputs else new_id(CAPTURE))
-        made = self.database.transact(lambda connection: self.queue.submit(
-            connection, project=PROJECT, key=None, request=request, chunk_frames=8, inputs=list(inputs)))
+        made = self.database.transact(lambda connection: self.queue.submit(connection, project=PROJECT, request=request, inputs=inputs))
         self.database.transact(lambda connection: connection.execute(tables.jobs.update().where(tables.jobs.c.id == made).values(
             state=state, finished_at=self.now if state in jobs.ENDED else None)))
         (self.results(made)).mkdir(parents=True)

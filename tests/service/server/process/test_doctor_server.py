@@ -81,7 +81,7 @@ def test_no_key_and_jobs_that_wait_for_nobody(relit, data, database, monkeypatch
     assert relit("doctor", "--device", "cpu", "--data", data).code == 0
     queue = JobQueue(database)
     database.transact(lambda connection: queue.submit(
-        connection, project="larch", key=None, request=CheckJob(kind="check", intake=new_id(CAPTURE)), chunk_frames=1, inputs=[]))
+        connection, project="larch", request=CheckJob(kind="check", intake=new_id(CAPTURE))))
     (line,) = wrong(relit, "--data", data)
     assert line.startswith("worker: none") and "1 jobs wait" in line
 

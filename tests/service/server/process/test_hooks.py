@@ -70,7 +70,7 @@ def test_a_job_whose_workers_died_is_told_and_a_check_is_not(site, receiver):
         assert jobs.begin(site.database, claim)
         site.database.transact(lambda connection, claim=claim: jobs.record_lost_worker(connection, claim, 1))
     check = site.database.transact(lambda connection: jobs.insert(
-        connection, project=PROJECT, key=None, request=CheckJob(kind="check", intake=new_id(CAPTURE)), chunk_frames=1, inputs=[]))
+        connection, project=PROJECT, request=CheckJob(kind="check", intake=new_id(CAPTURE))))
     assert site.database.transact(lambda connection: jobs.cancel(connection, check))
     site.send()
     site.send()

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import sqlalchemy as sa
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import ExportJob
 from service.server.database import audit, idempotency, intakes, jobs, tables, uploads, workers
 from service.server.process import housekeeping
@@ -62,10 +62,8 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 def test_uploads_that_nobody_goes_on_with_expire(house):
     capture, folder = house.capture(), house.settings.part_files
     parts = open_upload_parts(house.settings, house.database, house.storage)
-    upload, done = new_id(UPLOAD), new_id(UPLOAD)
-    for identifier in (upload, done):
-        house.database.transact(lambda connection, identifier=identifier: uploads.insert(
-            connection, identifier=identifier, project=PROJECT, intake=capture, path=identifier, length=10, sha256=None))
+    with house.database.begin() as connection:
+        upload, done = (uploads.insert(connection, project=PROJECT, intake=capture, path=path, length=10) for path in ("a", "b"))
     assert uploads.finish(house.database, done, 10)
     with closing(parts.open({"id": upload})) as part:
         part.append([b"12345"])

@@ -107,8 +107,7 @@ def test_other_scans_are_chosen_to_be_fused(page, server, depth):
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     with server.database() as database:
         database.transact(lambda connection: jobs.insert(
-            connection, project="default", key=None, request=DepthJob(kind="depth", capture=new_id(CAPTURE), name=name), chunk_frames=8,
-            inputs=[], finished=other))
+            connection, project="default", request=DepthJob(kind="depth", capture=new_id(CAPTURE), name=name), finished=other))
     with server.client() as client:
         capture = client.get(f"/v1/jobs/{depth[0]}").json()["request"]["capture"]
         page.goto(f"/object/{capture}")
