@@ -209,7 +209,6 @@ class UploadPatch:
             self._gone()
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
-
     def _still_there(self) -> Row:
         row = uploads.find(self._service.database, self._row["id"], self._row["project"])
         return self._gone() if row is None else row

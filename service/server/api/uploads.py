@@ -202,7 +202,6 @@ def _hold(service: Service, caller: Caller, connection: sa.Connection, intake: s
     raise ApiError("conflict", f"{intake} is {state}: its files do not change any more")
 
 
-
 def _row(service: Service, caller: Caller, upload: str) -> Row:
     row = uploads.find(service.database, upload, caller.project)
     if row is None:

@@ -4,8 +4,8 @@ and results of other jobs, as folders of this machine."""
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,7 +19,7 @@ from service.requests.answers import WARNING
 from service.requests.base.annotations import page_of
 from service.requests.base.base import JobRequest, Options
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
-from service.requests.jobs import ANY_JOB
+from service.requests.jobs import ANY_JOB, CheckJob
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs
 from service.server.database.engine import Database
@@ -48,8 +48,6 @@ class WorkerContext(NamedTuple):
     device: str
     worker: str
     """Name of the worker."""
-    held: ExitStack = ExitStack()
-    """Closes the folders of registered captures when a step ends."""
 
     def require_space(self) -> None:
         """Raise RequestError if less than `min_free_bytes` are left in the data folder."""
@@ -75,25 +73,27 @@ class Job(NamedTuple):
                    row["lost"] > 0 or row["lost_repeating"] > 0)
 
 
-class JobStep(NamedTuple):
-    """A part of a job that is done as a whole or again."""
-
-    name: str
-    run: Callable[[Progress], None]
-    frames: int = 0
-    """Number of frames that the step makes, at the same time as other workers make those of other steps."""
-    made: Callable[[], int] = lambda: 0
-    """Returns how many of these frames this machine has."""
-    help: Callable[[Progress], None] | None = None
-    """A function that does pieces of the step beside the worker that runs it; None: it cannot be divided."""
-
-
 class StepFiles(NamedTuple):
     """The files of a step that runs, and what else its product is given."""
 
     job: Job
     context: WorkerContext
     progress: Progress
+    held: ExitStack
+    """Closes what is opened for the step when it ends."""
+
+    @classmethod
+    @contextmanager
+    def of(cls, job: Job, context: WorkerContext, progress: Progress) -> "Iterator[StepFiles]":
+        """Yield the files of a step while it runs; images are decoded in processes of their own."""
+        from service.captures.decoders import Decoders
+        from stage.formats import images
+
+        with ExitStack() as held:
+            if not isinstance(job.request, CheckJob):  # which does not decode, and may run beside another step
+                decoders = held.enter_context(closing(Decoders(context.settings.max_pixels)))
+                held.enter_context(images.decoded_by(decoders))
+            yield cls(job, context, progress, held)
 
     def tell(self, result: object) -> None:
         """Write the warnings that a product's result has, if it has any, into the log of the job."""
@@ -171,8 +171,17 @@ class StepFiles(NamedTuple):
         if resolved(folder) != folder or root is None:
             raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
         top = folder if identifier.startswith(CAPTURE) else folder.parent
-        context.held.enter_context(inputs.confined(top, root, max_pixels=context.settings.max_pixels))
+        self.held.enter_context(inputs.confined(top, root, max_pixels=context.settings.max_pixels))
         return _named(folder, identifier), root
+
+    @contextmanager
+    def linked(self, jobs: Iterable[str], name: str) -> Iterator[Path]:
+        """Make a folder with links to the results of jobs, each by its identifier; reports have `name` for the folder."""
+        with tempfile.TemporaryDirectory(prefix="relit-linked-") as made:
+            folder = _named(Path(made), name)
+            for job in set(jobs):
+                (folder / job).symlink_to(self.maps(job), target_is_directory=True)
+            yield folder
 
     def write_annotations(self, source: str) -> None:
         """Write the annotations of a capture, or of that which a job began with, beside the results of this job; none: no file."""
@@ -184,6 +193,19 @@ class StepFiles(NamedTuple):
                 return
         if rows := intakes.annotations_of(database, found):
             write_text(self.out / ANNOTATIONS_FILE, page_of(found, rows).model_dump_json(by_alias=True, indent=1) + "\n")
+
+
+class JobStep(NamedTuple):
+    """A part of a job that is done as a whole or again."""
+
+    name: str
+    run: Callable[[StepFiles], None]
+    frames: int = 0
+    """Number of frames that the step makes, at the same time as other workers make those of other steps."""
+    made: Callable[[], int] = lambda: 0
+    """Returns how many of these frames this machine has."""
+    help: Callable[[StepFiles], None] | None = None
+    """A function that does pieces of the step beside the worker that runs it; None: it cannot be divided."""
 
 
 def file_within(capture: Path, name: str, field: str) -> Path:

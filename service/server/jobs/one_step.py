@@ -3,13 +3,10 @@
 Those that calibrate write manifests and reports among the results, and leave the captures as they are.
 """
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from service.reporting.provenance import name_place
 from service.requests import calibrate, calibration_jobs, jobs
 from service.requests.base.base import JobRequest, Options
 from service.requests.basis import BasisKind
@@ -98,11 +95,7 @@ def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
 def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
     from service.boards.gauge_board import gauge_board
 
-    with tempfile.TemporaryDirectory(prefix="relit-gauge-") as made:
-        folder = Path(made)
-        name_place(folder, files.job.id)
-        for run in request.study.runs:
-            (folder / run.result).symlink_to(files.maps(run.result), target_is_directory=True)
+    with files.linked((run.result for run in request.study.runs), files.job.id) as folder:
         write_text(folder / STUDY_FILE, request.study.model_dump_json(by_alias=True))
         files.tell(gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress))
 

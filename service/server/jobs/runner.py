@@ -24,7 +24,7 @@ from service.server.base.log import logger
 from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
-from service.server.jobs.context import Job, JobStep, WorkerContext, without_places
+from service.server.jobs.context import Job, JobStep, StepFiles, WorkerContext, without_places
 from service.server.jobs.pieces import HelpProgress, JobPieces
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
@@ -189,9 +189,10 @@ class JobRunner:
             if not isinstance(job.request, CheckJob):
                 progress.guard = self._context.require_space
             with (telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named(),
-                  nullcontext() if isinstance(job.request, CheckJob) else self._device):  # checks need no device
+                  nullcontext() if isinstance(job.request, CheckJob) else self._device,  # checks need no device
+                  StepFiles.of(job, self._context, progress) as files):
                 progress.begin(name.partition(" ")[0])
-                step.run(progress)
+                step.run(files)
             if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files
                 raise Stopped
             if not isinstance(job.request, CheckJob):

@@ -4,16 +4,14 @@ A solve or a depth of a sequence has a step for each time step alone, and one th
 files are sent to the storage when it ends; so a worker that takes over goes on with the time step that was under way.
 """
 
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.reporting.provenance import name_place
 from service.requests import jobs
 from service.requests.base.identifiers import CAPTURE
 from service.requests.light.frame_range import frame_numbers, numbered
@@ -39,24 +37,28 @@ TIME_STEP = "step"
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     """Return the steps of a job, which are always the same for the same job."""
-    from service.captures.decoders import Decoders
-    from stage.formats import images
-
-    held = ExitStack()
-
-    def closing(run: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        def step(progress: Progress) -> None:
-            with held:
-                if not isinstance(job.request, jobs.CheckJob):  # which does not decode, and may run beside another step
-                    decoders = Decoders(context.settings.max_pixels)
-                    held.callback(decoders.close)
-                    held.enter_context(images.decoded_by(decoders))
-                run(progress)
-
-        return step
-
-    return [step._replace(run=closing(step.run), help=None if step.help is None else closing(step.help))
-            for step in _steps_of(job, context._replace(held=held))]
+    request = job.request
+    if isinstance(request, jobs.CheckJob):
+        name, look = (("guess", importing.look) if request.guess else ("check", _check) if request.importing is None else
+                      ("import", importing.import_files))
+        return [JobStep(name, partial(look, request))]
+    if isinstance(request, jobs.SolveJob | jobs.DepthJob):
+        return _time_steps(job, request, context)
+    if isinstance(request, jobs.RegisterJob):
+        return [_shared(request.kind, partial(_register, request))]
+    if isinstance(request, jobs.FuseJob):
+        return [_shared(request.kind, partial(_fuse, request))]
+    if isinstance(request, jobs.RelightJob):
+        return _frames(job, request, context)
+    if not isinstance(request, jobs.PipelineJob):
+        name, do = ONE_STEP[type(request)]
+        return [JobStep(name, partial(do, request))]
+    solve = jobs.SolveJob(kind="solve", capture=request.capture, options=request.solve, sequence=request.sequence)
+    asset = jobs.ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
+    relight = jobs.RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
+                              maps=job.id if request.guided else None, options=request.relight)
+    return [*_time_steps(job, solve, context), JobStep("export", partial(export, asset)),
+            *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
 
 
 def help_with(job: Job, context: WorkerContext, progress: Progress) -> None:
@@ -70,51 +72,24 @@ def help_with(job: Job, context: WorkerContext, progress: Progress) -> None:
     divided = next((step for step in steps if step.name not in done and not step.frames), None)
     if divided is not None:
         if divided.help is not None:
-            divided.help(progress)
+            with StepFiles.of(job, context, progress) as files:
+                divided.help(files)
         return  # for the steps after it help is asked for again
     pieces.require_same_kind()
     for step in steps:
         if step.frames and step.name not in finished() and not pieces.is_finished(step.name) and pieces.claim_step(step.name):
             logger.info("help with step", job=job.id, step=step.name, worker=context.worker)
-            step.run(progress)
+            with StepFiles.of(job, context, progress) as files:
+                step.run(files)
             context.storage.publish(layout.results(job.project, job.id), progress, alone=False)
             pieces.finish_step(step.name)
 
 
-def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
-    request = job.request
-
-    def step(name: str, do: Callable[..., None], *given: Any) -> JobStep:
-        return JobStep(name, lambda progress: do(*given, StepFiles(job, context, progress)))
-
-    if isinstance(request, jobs.CheckJob):
-        name, look = (("guess", importing.look) if request.guess else ("check", _check) if request.importing is None else
-                      ("import", importing.import_files))
-        return [step(name, look, request)]
-    if isinstance(request, jobs.SolveJob | jobs.DepthJob):
-        return _time_steps(job, request, context)
-    if isinstance(request, jobs.RegisterJob):
-        return [_shared(request.kind, partial(_register, request), job, context)]
-    if isinstance(request, jobs.FuseJob):
-        return [_shared(request.kind, partial(_fuse, request), job, context)]
-    if isinstance(request, jobs.RelightJob):
-        return _frames(job, request, context)
-    if not isinstance(request, jobs.PipelineJob):
-        name, do = ONE_STEP[type(request)]
-        return [step(name, do, request)]
-    solve = jobs.SolveJob(kind="solve", capture=request.capture, options=request.solve, sequence=request.sequence)
-    asset = jobs.ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
-    relight = jobs.RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
-                              maps=job.id if request.guided else None, options=request.relight)
-    return [*_time_steps(job, solve, context), step("export", export, asset),
-            *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
-
-
-def _shared(name: str, do: Callable[..., None], job: Job, context: WorkerContext) -> JobStep:
+def _shared(name: str, do: Callable[..., None]) -> JobStep:
     """Return a step of which several workers do pieces; `do` is called with its pieces and, by its name, whether this worker leads."""
-    def run(progress: Progress, *, leads: bool) -> None:
-        pieces = JobPieces(context, job)
-        do(StepFiles(job, context, progress), pieces, leads=leads)
+    def run(files: StepFiles, *, leads: bool) -> None:
+        pieces = JobPieces(files.context, files.job)
+        do(files, pieces, leads=leads)
         if leads:
             pieces.remove()
 
@@ -126,14 +101,14 @@ def _time_steps(job: Job, request: jobs.SolveJob | jobs.DepthJob, context: Worke
     def step(name: str, number: int | None) -> JobStep:
         """Return the step that does the capture, or the time step `number` of a sequence."""
         if isinstance(request, jobs.SolveJob):
-            return _shared(name, partial(_solve, request, number), job, context)
-        return JobStep(name, lambda progress: _depth(request, number, StepFiles(job, context, progress)))
+            return _shared(name, partial(_solve, request, number))
+        return JobStep(name, partial(_depth, request, number))
 
     count = intakes.time_steps(intakes.find(context.database, request.capture, job.project))
     if count == 0:
         return [step("solve" if isinstance(request, jobs.SolveJob) else "depth", None)]
     return [*(step(f"{TIME_STEP} {number}", number) for number in range(1, count + 1)),
-            JobStep(SEQUENCE, lambda progress: _join(request, StepFiles(job, context, progress)))]
+            JobStep(SEQUENCE, partial(_join, request))]
 
 
 def _solve(request: jobs.SolveJob, number: int | None, files: StepFiles, pieces: JobPieces, *, leads: bool) -> None:
@@ -207,8 +182,8 @@ def _frames(job: Job, request: jobs.RelightJob, context: WorkerContext) -> list[
 
     def step(chunk: list[int]) -> JobStep:
         out = layout.results(job.project, job.id)
-        return JobStep(f"frames {chunk[0]}-{chunk[-1]}", lambda progress: _relight(request, chunk, StepFiles(job, context, progress)),
-                       len(chunk), lambda: sum(_is_made(context.storage.workspace(out), number) for number in chunk))
+        return JobStep(f"frames {chunk[0]}-{chunk[-1]}", partial(_relight, request, chunk), len(chunk),
+                       lambda: sum(_is_made(context.storage.workspace(out), number) for number in chunk))
 
     return [step(chunk) for chunk in chunks]
 
@@ -294,10 +269,6 @@ def _sharing(pieces: JobPieces, *, leads: bool) -> "SharedPieces":
 @contextmanager
 def _linked(scans: ScanSet, files: StepFiles, name: str) -> Iterator[Path]:
     """Make a folder with a scan-set.json and, beside it, links to the results of the jobs that its paths name."""
-    with tempfile.TemporaryDirectory(prefix="relit-scans-") as made:
-        folder = Path(made)
-        name_place(folder, name)
-        for job in {path for entry in scans.scans for path in (entry.path, entry.maps) if path is not None}:
-            (folder / job).symlink_to(files.maps(job), target_is_directory=True)
+    with files.linked((path for entry in scans.scans for path in (entry.path, entry.maps) if path is not None), name) as folder:
         write_scan_set(scans, folder / SCAN_SET_FILE)
         yield folder

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus
 
+from service.reporting.progress import Timings
+from service.reporting.provenance import places_named
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import ANY_JOB, RelightJob
@@ -21,8 +23,9 @@ from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
 from service.server.database.jobs import Claim
-from service.server.jobs.context import WorkerContext
+from service.server.jobs.context import Job, StepFiles, WorkerContext
 from service.server.jobs.queue import JobQueue, workflow_id
+from service.server.jobs.steps import steps_of
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
 from tests.service.server.prepared import prepare
@@ -204,6 +207,13 @@ class Harness:
 
     def tail(self) -> str:
         return self.log.read_text()[-6000:] if self.log.exists() else ""
+
+
+def do_step(job: Job, context: WorkerContext, name: str | None = None) -> None:
+    """Do a step of a job as its worker does; without a name, the only one."""
+    step, = [step for step in steps_of(job, context) if name in (None, step.name)]
+    with places_named(), StepFiles.of(job, context, Timings()) as files:
+        step.run(files)
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """An import that is killed, or that a project has no room for, leaves nothing in the capture, and can be done again."""
 
-from types import SimpleNamespace
 
 import pytest
 
@@ -10,16 +9,14 @@ from service.requests.base.import_choices import ImportChoices
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, uploads
 from service.server.jobs.context import Job
-from service.server.jobs.steps import steps_of
 from service.server.storage import layout
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import open_storage
 from tests.marks import first_short
 from tests.scenes.foreign import write_photographs
-from tests.service.server.jobs.harness import PROJECT
+from tests.service.server.jobs.harness import PROJECT, do_step
 
 ON_SQLITE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
-SILENT = SimpleNamespace(stage=lambda *_: None, advance=lambda *_: None)
 CHOICES = ImportChoices(layout="olat", options={"axes": "right,up,towards", "sense": "to-light"})
 
 
@@ -40,8 +37,7 @@ def uploaded(idle_harness, tmp_path):
 
 def run(harness, identifier, choices=CHOICES, **settings):
     job = Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=choices), 1)
-    step, = steps_of(job, harness.context(**settings))
-    step.run(SILENT)
+    do_step(job, harness.context(**settings))
 
 
 def stored(harness, identifier):

@@ -46,7 +46,7 @@ def once(error, then):
     return call
 
 
-def do_nothing(monkeypatch, run=lambda progress: None):
+def do_nothing(monkeypatch, run=lambda files: None):
     monkeypatch.setattr(runner_module, "steps_of", lambda job, context: [JobStep(name, run) for name in NAMES])
 
 
@@ -66,7 +66,7 @@ def test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left(idle_har
     made, claim = runner
     begun = []
     monkeypatch.setattr(runner_module, "steps_of", lambda job, context: [
-        JobStep(name, lambda progress, name=name: begun.append(name)) for name in NAMES])
+        JobStep(name, lambda files, name=name: begun.append(name)) for name in NAMES])
     jobs.begin(idle_harness.database, claim)
     jobs.finish_step(idle_harness.database, claim, NAMES[:1])
     assert made.run(claim) == DONE
@@ -110,7 +110,7 @@ def test_a_job_that_another_version_began_is_made_anew(idle_harness, runner, mon
         jobs.finish_step(idle_harness.database, claim, NAMES[:1])
     assert idle_harness.row(claim.job)["version"] == "0.0.1"
     done = []
-    do_nothing(monkeypatch, lambda progress: done.append(progress))
+    do_nothing(monkeypatch, done.append)
     assert made.run(claim) == DONE
     assert len(done) == 2
     row = idle_harness.row(claim.job)
@@ -121,7 +121,7 @@ def test_a_job_that_another_version_began_is_made_anew(idle_harness, runner, mon
 def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, runner, monkeypatch):
     made, claim = runner
 
-    def lose(progress):
+    def lose(files):
         idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3))
 
     do_nothing(monkeypatch, lose)
@@ -138,7 +138,7 @@ def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, ru
     made, claim = runner
     folder = idle_harness.results(claim.job)
 
-    def run(progress):
+    def run(files):
         write_text(folder / "frame.0001.exr", "before")
         idle_harness.database.transact(lambda connection: jobs.cancel(connection, claim.job))
         idle_harness.database.transact(lambda connection: jobs.remove(connection, claim.job))
@@ -146,8 +146,8 @@ def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, ru
         assert not folder.exists()
         write_text(folder / "frame.0002.exr", "after")
         if end == "stopped":
-            monkeypatch.setattr(progress, "_record_at", 0.0)
-            progress.advance(2)
+            monkeypatch.setattr(files.progress, "_record_at", 0.0)
+            files.progress.advance(2)
         if end == "failed":
             raise StorageError("the disk is full")
 
@@ -163,7 +163,7 @@ def test_a_cancelled_step_ends_before_the_next_job_works_on_the_device(idle_harn
     idle_harness.take(second.job, "one")
     begun, cancelled, order = threading.Event(), threading.Event(), []
 
-    def run(progress):
+    def run(files):
         if not begun.is_set():
             begun.set()
             assert cancelled.wait(30)
@@ -190,6 +190,6 @@ def test_a_step_that_would_fill_the_disk_fails_with_a_sentence(runner, idle_harn
     made, claim = runner
     settings = idle_harness.settings.model_copy(update={"min_free_bytes": 1 << 60})
     made._context = made._context._replace(settings=settings)
-    do_nothing(monkeypatch, lambda progress: pytest.fail("there is no space"))
+    do_nothing(monkeypatch, lambda files: pytest.fail("there is no space"))
     assert made.run(claim) == "failed"
     assert "no space left for this job (min_free_bytes)" in idle_harness.row(claim.job)["error"]

@@ -6,7 +6,6 @@ import signal
 import numpy as np
 import pytest
 
-from service.reporting.provenance import places_named
 from service.requests.base.base import SequenceOptions
 from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import DepthJob, SolveJob
@@ -21,7 +20,7 @@ from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step
 from tests.service.recording import Recording
-from tests.service.server.jobs.harness import PROJECT, harness
+from tests.service.server.jobs.harness import PROJECT, do_step, harness
 
 STEPS = 4
 
@@ -56,8 +55,7 @@ def solve_of(harness, sequence, **options) -> Job:
 
 def run(job: Job, context: WorkerContext, name: str) -> None:
     """What the worker does in a step."""
-    with places_named():
-        next(step for step in steps_of(job, context) if step.name == name).run(Recording())
+    do_step(job, context, name)
     context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Recording())
 
 

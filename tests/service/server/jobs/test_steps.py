@@ -1,7 +1,6 @@
 """Steps read the files of a registered capture beneath its folder, whatever becomes a link while they run."""
 
 import os
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +12,12 @@ from service.requests.light.frame_range import numbered
 from service.requests.solve import SolveOptions
 from service.server.database import intakes
 from service.server.jobs.context import Job
-from service.server.jobs.steps import _parts, steps_of
+from service.server.jobs.steps import _parts
 from service.server.storage import layout
 from stage.errors import StageError
 from stage.formats import exr, images
 from tests.scenes.captures import make_scene, write_capture
-from tests.service.recording import Recording
-from tests.service.server.jobs.harness import PROJECT
+from tests.service.server.jobs.harness import PROJECT, do_step
 
 
 @pytest.mark.parametrize(("there", "parts"), [
@@ -35,14 +33,14 @@ def capture(tmp_path_factory):
     return write_capture(tmp_path_factory.mktemp("registered") / "capture", make_scene(size=8, lights=5))
 
 
-def step_of(harness, capture, roots):
+def solve(harness, capture):
     identifier = harness.register(capture, CAPTURE)
-    return only_step(harness, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")), roots)
+    do(harness, capture, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")))
 
 
-def only_step(harness, request, roots, **settings):
-    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, request, 1), harness.context(roots=roots, max_pixels=64, **settings))
-    return step
+def do(harness, capture, request, **settings):
+    job = Job("job_0123456789abcdefghjk", PROJECT, request, 1)
+    do_step(job, harness.context(roots=(capture.parent,), max_pixels=64, **settings))
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
@@ -51,7 +49,7 @@ def only_step(harness, request, roots, **settings):
 def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harness, capture, tmp_path, monkeypatch, name):
     from service.solve import solve as product
 
-    outside, solve = tmp_path / "outside", product.solve
+    outside, whole = tmp_path / "outside", product.solve
     outside.mkdir()
     if name.endswith(".exr"):
         exr.write(outside / name, dict.fromkeys("RGB", np.full((8, 8), 0.5, np.float16)), color_space="lin_rec709_scene", metadata={})
@@ -61,22 +59,21 @@ def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harnes
     def swapped(request, progress, **others):
         (capture / name).unlink()
         (capture / name).symlink_to(outside / name)
-        solve(request, progress, **others)
+        whole(request, progress, **others)
 
     monkeypatch.setattr(product, "solve", swapped)
     with pytest.raises(StageError, match=f"{name}: leads out of the folder"):
-        step_of(idle_harness, capture, (capture.parent,)).run(Recording())
+        solve(idle_harness, capture)
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.long
 def test_the_worker_decodes_no_image_of_a_capture_and_closes_its_folder(idle_harness, capture, monkeypatch):
     before = len(os.listdir("/proc/self/fd"))
-    step = step_of(idle_harness, capture, (capture.parent,))
     for name in ("recorded_of", "header_of"):
         monkeypatch.setattr(images, name, lambda source: pytest.fail(f"{source.path} is read here"))
     for _ in range(3):
-        step.run(Recording())
+        solve(idle_harness, capture)
     assert len(os.listdir("/proc/self/fd")) <= before + 5  # connections of the database
     assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
 
@@ -84,13 +81,10 @@ def test_the_worker_decodes_no_image_of_a_capture_and_closes_its_folder(idle_har
 @pytest.mark.long
 def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness, capture):
     """The capture has five images of 8 × 8."""
-    silent = SimpleNamespace(stage=lambda *_: None, advance=lambda *_: None)  # a check advances before it names a stage
-
     def checked(most):
         identifier = idle_harness.database.transact(lambda connection: intakes.insert(
             connection, project=PROJECT, kind=CAPTURE, name="x", folder=capture))
-        only_step(idle_harness, CheckJob(kind="check", intake=identifier), (capture.parent,),
-                  max_project_pixels=most).run(silent)
+        do(idle_harness, capture, CheckJob(kind="check", intake=identifier), max_project_pixels=most)
         return intakes.find(idle_harness.database, identifier, PROJECT)["state"]
 
     assert checked(320) == "ready"
