@@ -313,7 +313,6 @@ class StoredParts(UploadParts):
                 logger.warning("locks of uploads are not renewed", error=message_of(error))
 
 
-
 def open_upload_parts(settings: Settings, database: Database, storage: Storage) -> UploadParts:
     """Return the part files of the service that the settings describe."""
     if settings.storage_url is None:

@@ -1,5 +1,7 @@
 """A database of SQLite with all tables, made once a run and copied: making them takes some tenths of a second."""
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,13 +20,20 @@ def prepare(settings: Settings, database: Database) -> None:
         queue.prepare(settings, database)
 
 
+@contextmanager
+def opened(settings: Settings) -> Iterator[Database]:
+    """The database of a service, with all tables."""
+    with closing(connect(settings.sqlalchemy_url)) as database:
+        prepare(settings, database)
+        yield database
+
+
 @cache
 def _with_tables() -> bytes:
     with TemporaryDirectory() as folder:
         settings = Settings(data=Path(folder))
-        database = connect(settings.sqlalchemy_url)
-        queue.prepare(settings, database)
-        with database.engine.connect() as connection:
-            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
-        database.close()
+        with closing(connect(settings.sqlalchemy_url)) as database:
+            queue.prepare(settings, database)
+            with database.engine.connect() as connection:
+                connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
         return settings.sqlite_file.read_bytes()

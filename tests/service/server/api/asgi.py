@@ -11,8 +11,7 @@ from fastapi import FastAPI
 
 from service.server.api.app import create_app
 from service.server.base.settings import Settings
-from service.server.database.engine import connect
-from tests.service.server.prepared import prepare
+from tests.service.server.prepared import opened
 
 
 class Call:
@@ -56,12 +55,8 @@ class Call:
 @contextmanager
 def app_of(settings: Settings) -> Iterator[FastAPI]:
     """The app over a database of its own, in this process and without workers."""
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    try:
+    with opened(settings) as database:
         yield create_app(settings, database)
-    finally:
-        database.close()
 
 
 def asynchronous(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:

@@ -1,5 +1,6 @@
 """Jobs through the API, as tests ask for them and wait for them."""
 
+import json
 from pathlib import Path
 
 import httpx2
@@ -22,9 +23,31 @@ def submit(client: httpx2.Client, **request) -> dict:
 
 
 def finish(server: Server, client: httpx2.Client, job: dict, state: str = "succeeded") -> dict:
-    done = server.wait(client, f"/v1/jobs/{job['id']}", ENDED, timeout_s=300)
-    assert done["state"] == state, done
-    return done
+    ended = server.wait(client, f"/v1/jobs/{job['id']}", ENDED, timeout_s=300)
+    assert ended["state"] == state, ended
+    assert str(server.data) not in str(ended["error"])
+    return ended
+
+
+def finished(server: Server, client: httpx2.Client, **request) -> dict:
+    """A job that succeeds."""
+    return finish(server, client, submit(client, **request))
+
+
+def error_of(server: Server, client: httpx2.Client, **request) -> str:
+    """The error of a job that fails, which names no folder of the server."""
+    return finish(server, client, submit(client, **request), "failed")["error"]
+
+
+def result(client: httpx2.Client, job: dict, name: str) -> bytes:
+    return client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content
+
+
+def report_of(server: Server, client: httpx2.Client, job: dict, name: str = "report.json") -> dict:
+    """What a job reports, which names no folder of the server."""
+    text = result(client, job, name).decode()
+    assert str(server.data) not in text and "/relit-linked-" not in text
+    return json.loads(text)
 
 
 def made_by(client: httpx2.Client, job: dict) -> set[str]:

@@ -86,7 +86,6 @@ def of_admins(path: str) -> bool:
     return path in ("/metrics", "/v1/audit") or path.startswith(("/v1/machines", "/v1/hooks"))
 
 
-
 @pytest.mark.long
 def test_every_route_but_those_of_health_asks_for_a_key(site):
     with site.server.client() as client:

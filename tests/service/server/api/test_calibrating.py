@@ -25,7 +25,7 @@ from tests.service.calibrate.test_laser_planes import boards as laser_boards
 from tests.service.calibrate.test_procam import write_view
 from tests.service.depth.tof.test_tof import pulsed_frames
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import admitted, error_of, finish, finished, made_by, refused, report_of, result, submit
 from tests.service.server.api.test_measuring import files_of, upload
 
 LEVELS = np.linspace(0, 1, 5).tolist()
@@ -43,7 +43,7 @@ def compare(client, job: dict, made: Path, names: dict[str, str], places: dict[P
     """Compare results with the files that a command made: `names` gives the file of the command for each result."""
     assert made_by(client, job) == set(names)
     for name, there in names.items():
-        found = client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content
+        found = result(client, job, name)
         wanted = (made / there).read_bytes()
         for folder, identifier in places.items():  # a service does not say where its folders lie
             wanted = wanted.replace(str(folder).encode(), identifier.encode())
@@ -97,7 +97,7 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
     here = Path(shutil.copytree(sensor, tmp_path / "cap"))
     given = {name: tuple(here / each for each in value) for name, value in fields.items() if name != "options"} | fields.get("options", {})
     product(model(capture=here, **given, **({"write": True} if kind == "saturation" else {})))
-    job = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields))
+    job = finished(server, client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
     compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", made) if name}, {here: uploaded})
 
 
@@ -108,7 +108,7 @@ def test_the_colours_of_a_chart(server, client, tmp_path):
         f"{row['name']},{r},{g},{b}" for row, (r, g, b) in zip(table(), reflectances(), strict=True)))
     uploaded = sent(server, client, here)
     calibrate_chart(ChartRequest(capture=here, reflectances=here / "chart.csv"))
-    job = finish(server, client, submit(client, kind="calibrate-chart", capture=uploaded, reflectances="chart.csv"))
+    job = finished(server, client, kind="calibrate-chart", capture=uploaded, reflectances="chart.csv")
     compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", "chart.png")}, {here: uploaded})
 
 
@@ -118,7 +118,7 @@ def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
     calibrate_tof(requests.TofCalibrationRequest(sweep=path, out=tmp_path / "tof.json", device="cpu"))
     uploaded = sent(server, client, path.parent)
-    job = finish(server, client, submit(client, kind="calibrate-tof", capture=uploaded))
+    job = finished(server, client, kind="calibrate-tof", capture=uploaded)
     compare(client, job, tmp_path, {name: name for name in ("tof.json", "calibration.json")}, {path.parent: uploaded})
 
 
@@ -130,20 +130,17 @@ def test_a_sweep_of_another_capture(server, client, tmp_path):
     for away in ("/etc", f"d0/../../{other}/d0"):
         data["steps"][1]["capture"] = away
         path.write_text(json.dumps(data))
-        job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
-        error = finish(server, client, job, "failed")["error"]
-        assert "is none of the captures" in error and str(server.data) not in error
-    away_too = submit(client, kind="calibrate-tof", capture=other, sweep="../sweep.json")
-    assert "sweep: '../sweep.json' leads out" in finish(server, client, away_too, "failed")["error"]
+        assert "is none of the captures" in error_of(server, client, kind="calibrate-tof", capture=sent(server, client, path.parent))
+    assert "sweep: '../sweep.json' leads out" in error_of(server, client, kind="calibrate-tof", capture=other, sweep="../sweep.json")
 
 
-def calibrated(client, job: dict, ids: list[str], folders: list[Path]) -> dict:
+def calibrated(server, client, job: dict, ids: list[str], folders: list[Path]) -> dict:
     """Compare the manifests of a job with those that the command wrote into folders, and return what was measured."""
     assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
     for identifier, folder in zip(ids, folders, strict=True):
-        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
+        found = report_of(server, client, job, f"{identifier}.capture.json")
         same(found, json.loads((folder / "capture.json").read_text()))
-    return client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()
+    return report_of(server, client, job, "calibration.json")
 
 
 @pytest.mark.long
@@ -162,7 +159,7 @@ def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     result = procam(requests.ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
     log = client.get(f"/v1/jobs/{job['id']}/log").json()["entries"]
     assert [entry["text"] for entry in log if entry["text"].startswith("warning: ")] == [f"warning: {said}" for said in result.warnings]
-    report = calibrated(client, job, ids, folders)["procam"]
+    report = calibrated(server, client, job, ids, folders)["procam"]
     assert report["captures"] == [view["view"] for view in report["views"]] == ids[:3]
     assert report["options"]["apply_to"] == ids[3:]
     assert before == {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
@@ -175,9 +172,9 @@ def test_the_planes_of_a_laser(server, client, tmp_path):
     folders = laser_boards(tmp_path)
     ids = [sent(server, client, folder) for folder in folders]
     board = {"board": "x".join(map(str, boards.BOARD)), "square_m": boards.SQUARE}
-    job = finish(server, client, submit(client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board))
+    job = finished(server, client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board)
     laser_planes(requests.LaserPlanesRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **board))
-    report = calibrated(client, job, ids, folders)["laser-planes"]
+    report = calibrated(server, client, job, ids, folders)["laser-planes"]
     assert [board["capture"] for board in report["boards"]] == ids[:3]
 
 
@@ -201,25 +198,23 @@ def test_requests_that_are_refused(client, fields, words):
 @pytest.mark.long
 def test_images_or_a_ball_that_are_not_there(server, client, uploaded, dome):
     for kind, names in (("dark", ["none.exr"]), ("dark", ["../x.exr"]), ("flat-field", ["/etc/passwd"])):
-        error = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, images=names), "failed")["error"]
-        assert error.startswith(f"images: {names[0]!r} ") and str(server.data) not in error
-    job = submit(client, kind="calibrate-response", capture=uploaded, images=GREYS, options={"levels": [0, 1]})
-    assert "--levels: has 2 values, there are 5 images" in finish(server, client, job, "failed")["error"]
+        error = error_of(server, client, kind=f"calibrate-{kind}", capture=uploaded, images=names)
+        assert error.startswith(f"images: {names[0]!r} ")
+    assert "--levels: has 2 values, there are 5 images" in error_of(
+        server, client, kind="calibrate-response", capture=uploaded, images=GREYS, options={"levels": [0, 1]})
     missing = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [f"cap_{'0' * 20}"], "options": BOARD})
     refused(missing, 404, "captures: cap_00000000000000000000 is not in this project")
-    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
-    assert "ball" in finish(server, client, job, "failed")["error"]
-    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
-    assert "leads out of the capture's folder" in finish(server, client, job, "failed")["error"]
+    assert "ball" in error_of(server, client, kind="calibrate-mirror-ball", capture=dome)
+    assert "leads out of the capture's folder" in error_of(server, client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
 
 
 @pytest.mark.long
 def test_the_brightness_of_lights(server, client, dome):
-    job = finish(server, client, submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100}))
+    job = finished(server, client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
     assert made_by(client, job) == {"capture.json", "calibration.json"}
-    measured = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["intensity"]
-    assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
-    assert str(server.data) not in json.dumps(measured) and str(SAMPLES) not in json.dumps(measured)
+    measured = report_of(server, client, job, "calibration.json")["intensity"]
+    assert len(measured["lights"]) == len(report_of(server, client, job, "capture.json")["frames"])
+    assert str(SAMPLES) not in json.dumps(measured)
     assert measured["options"]["capture"] == measured["capture"] == dome
 
 
@@ -232,11 +227,10 @@ def test_the_lamps_of_a_rig_are_measured_by_a_job(server, client, relit, tmp_pat
     shutil.copy(table, capture / "cues.csv")
     identifier = sent(server, client, capture)
     (u, v, radius), options = map(float, lamps.CIRCLE.split(",")), {"albedo": [lamps.ALBEDO] * 3}
-    job = submit(client, kind="calibrate-rig", capture=identifier, rig=json.loads(rig.read_text()), table="cues.csv",
-                 options={"circles": [{"u": u, "v": v, "radius_px": radius}], **options})
-    finish(server, client, job)
+    job = finished(server, client, kind="calibrate-rig", capture=identifier, rig=json.loads(rig.read_text()), table="cues.csv",
+               options={"circles": [{"u": u, "v": v, "radius_px": radius}], **options})
     assert made_by(client, job) == {"rig.json", "measured.json", "calibration.json"}
     relit.done("calibrate", "rig", capture, rig, "--table", table, "--ball", lamps.CIRCLE, "--albedo", lamps.ALBEDO,
                "--out", tmp_path / "measured.json")
-    found = client.get(f"/v1/jobs/{job['id']}/results/measured.json").raise_for_status().json()
+    found = report_of(server, client, job, "measured.json")
     same(found, json.loads((tmp_path / "measured.json").read_text()))

@@ -97,7 +97,6 @@ def test_a_stream_that_cannot_be_is_refused(client, solved):
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
-
 def test_streams_stay_open_while_postgresql_restarts(tmp_path: Path, server_postgres):
     with (serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server,
           server.client() as client, server.database() as database):

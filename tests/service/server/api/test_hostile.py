@@ -30,7 +30,7 @@ from tests.service.server.api.captures import (
     write_image,
 )
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import admitted, finish, submit
+from tests.service.server.api.job_calls import admitted, error_of, submit
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("worker_lives")]
 
@@ -217,8 +217,7 @@ def test_a_registered_capture_that_changed_is_not_read(server, client, registere
     capture = admitted(server, client, folder)["id"]
 
     def solve_error() -> str:
-        job = submit(client, kind="solve", capture=capture, options={"method": "lambert"})
-        return finish(server, client, job, "failed")["error"]
+        return error_of(server, client, kind="solve", capture=capture, options={"method": "lambert"})
 
     shutil.copy(folder / "001.exr", registered / "elsewhere.exr")
     linked("001.exr", registered / "elsewhere.exr")(folder)

@@ -1,6 +1,5 @@
 """Captures and environments: created or registered, looked at, checked, annotated, deleted."""
 
-import json
 import shutil
 
 import pytest
@@ -9,14 +8,14 @@ from service.client import Client
 from service.publish.annotations import read_annotations
 from service.requests.base.identifiers import ANNOTATION, CAPTURE, new_id
 from service.requests.jobs import CheckJob
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs
-from service.server.database.engine import connect
 from service.server.database.jobs import Claim
-from service.server.database.schema import upgrade
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import admitted, finish, finished, made_by, refused, report_of, submit
 from tests.service.server.api.tus import encoded
+from tests.service.server.prepared import opened
 
 
 def test_captures_are_created_looked_at_deleted_and_listed_in_pages(client):
@@ -81,25 +80,23 @@ def test_what_has_no_file_is_refused_and_its_check_begins_again_by_another_valid
 @pytest.mark.parametrize("end", ["cancelled", "lost"])
 def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     """Cancelled, or the death of worker after worker: what it was to look at is refused, and does not check for ever."""
-    database = connect(f"sqlite:///{tmp_path / 'test.sqlite'}")
-    upgrade(database)
-    with database.begin() as connection:
-        capture = intakes.insert(connection, project="p", kind=CAPTURE, name="test", folder=tmp_path)
-        job = jobs.insert(connection, project="p", request=CheckJob(kind="check", intake=capture), inputs=[capture])
-    if end == "cancelled":
-        assert database.transact(lambda connection: jobs.cancel(connection, job))
-    else:
-        claim = Claim(job, 1, "worker")
-        assert jobs.begin(database, claim)
-        assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0)) == jobs.FAILED
-    found = intakes.find(database, capture, "p")
-    assert found is not None and found["state"] == "refused"
-    assert ("cancelled" if end == "cancelled" else "lost 1 workers") in found["problem"]
-    assert database.transact(lambda connection: intakes.begin_check(connection, capture))
-    assert not database.transact(lambda connection: jobs.cancel(connection, job))
-    found = intakes.find(database, capture, "p")
-    assert found is not None and found["state"] == "checking"  # the check that ended before has no say in this one
-    database.close()
+    with opened(Settings(data=tmp_path)) as database:
+        with database.begin() as connection:
+            capture = intakes.insert(connection, project="p", kind=CAPTURE, name="test", folder=tmp_path)
+            job = jobs.insert(connection, project="p", request=CheckJob(kind="check", intake=capture), inputs=[capture])
+        if end == "cancelled":
+            assert database.transact(lambda connection: jobs.cancel(connection, job))
+        else:
+            claim = Claim(job, 1, "worker")
+            assert jobs.begin(database, claim)
+            assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0)) == jobs.FAILED
+        found = intakes.find(database, capture, "p")
+        assert found is not None and found["state"] == "refused"
+        assert ("cancelled" if end == "cancelled" else "lost 1 workers") in found["problem"]
+        assert database.transact(lambda connection: intakes.begin_check(connection, capture))
+        assert not database.transact(lambda connection: jobs.cancel(connection, job))
+        found = intakes.find(database, capture, "p")
+        assert found is not None and found["state"] == "checking"  # the check that ended before has no say in this one
 
 
 @pytest.mark.long
@@ -221,8 +218,7 @@ def test_the_client_adds_and_deletes_them(server, client, registered):
 
 @pytest.mark.long
 def test_an_export_has_the_annotations_of_its_capture(server, client, noted):
-    solve = finish(server, client, submit(client, kind="solve", capture=noted, options={"method": "lambert"}))
-    export = finish(server, client, submit(client, kind="export", maps=solve["id"]))
+    solve = finished(server, client, kind="solve", capture=noted, options={"method": "lambert"})
+    export = finished(server, client, kind="export", maps=solve["id"])
     assert "annotations.json" in made_by(client, export)
-    file = client.get(f"/v1/jobs/{export['id']}/results/annotations.json").raise_for_status()
-    assert json.loads(file.content) == client.get(f"/v1/captures/{noted}/annotations").json()
+    assert report_of(server, client, export, "annotations.json") == client.get(f"/v1/captures/{noted}/annotations").json()

@@ -3,7 +3,7 @@
 import httpx2
 import pytest
 
-from tests.service.server.api.job_calls import NOBODY, finish, has_made, made_by, refused, submit
+from tests.service.server.api.job_calls import NOBODY, finish, finished, has_made, made_by, refused, submit
 from tests.service.waiting import until
 
 pytestmark = pytest.mark.long
@@ -30,7 +30,7 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     until(lambda: any(line["event"] == "step stopped" and line.get("job") == job["id"] for line in server.lines()), "not stopped")
     frames = made_by(client, job)
     assert 2 <= len(frames) < 300
-    finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
+    finished(server, client, kind="solve", capture=dome, options={"method": "lambert"})
     assert made_by(client, job) == frames  # nobody works on it any more
     assert [line for line in server.lines() if line["level"] == "error"] == []
     assert client.get(f"/v1/jobs/{job['id']}").json() == cancelled.json()
@@ -43,7 +43,7 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
     until(lambda: any(line["event"] == "step stopped" and line.get("job") == job for line in server.lines()), "not stopped")
-    finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
+    finished(server, client, kind="solve", capture=dome, options={"method": "lambert"})
     assert [line for line in server.lines() if line["level"] == "error"] == []
 
 
@@ -52,16 +52,16 @@ def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     job = submit(client, **request, name="slow")
     has_made(client, job, 2)
     client.post(f"/v1/jobs/{job['id']}/cancel").raise_for_status()
-    finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))  # the worker is at the next job now
+    finished(server, client, kind="solve", capture=dome, options={"method": "lambert"})  # the worker is at the next job now
     folder = server.data / "projects/default/jobs" / job["id"]
     done = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.glob("frame.*.exr")}
     assert 2 <= len(done) < 24
     refused(client.post(f"/v1/jobs/{job['id']}/retry"), 409, "is cancelled, not failed")
     assert client.post(f"/v1/jobs/{job['id']}/resume").json()["attempt"] == 2
-    finished = finish(server, client, job)
-    assert (finished["progress"]["done"], finished["attempt"]) == (24, 2)
+    ended = finish(server, client, job)
+    assert (ended["progress"]["done"], ended["attempt"]) == (24, 2)
     assert {name: ((folder / name).stat().st_ino, (folder / name).stat().st_mtime_ns) for name in done} == done
-    undisturbed = server.data / "projects/default/jobs" / finish(server, client, submit(client, **request))["id"]
+    undisturbed = server.data / "projects/default/jobs" / finished(server, client, **request)["id"]
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {path.name: path.read_bytes() for path in undisturbed.iterdir()}
 
 
@@ -94,7 +94,7 @@ def texts(client: httpx2.Client, job: dict) -> list[str]:
 
 
 def test_the_log_says_what_happened_and_goes_with_its_job(server, client, dome, long):
-    solved = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
+    solved = finished(server, client, kind="solve", capture=dome, options={"method": "lambert"})
     found = texts(client, solved)
     assert found[0] == "1 begun by a worker" and found[-1] == "1 succeeded"
     assert any(each.startswith("1 ingest, ") for each in found) and any(each.startswith("1 normals, ") for each in found)

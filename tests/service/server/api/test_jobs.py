@@ -9,7 +9,7 @@ import pytest
 from service.requests.base.identifiers import new_id
 from service.requests.jobs import JOBS
 from service.server.database.engine import storable
-from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import NOBODY, finish, finished, made_by, refused, report_of, result, submit
 
 
 @pytest.mark.long
@@ -31,13 +31,11 @@ def test_a_solve_and_an_export_that_brings_lights_along(server, client, dome, so
                                          "method": "lambert", "lights": "declared", "intensities": "chosen",
                                          "materials": "coherent", "max_sigma": None, "least_confidence": None}
     assert made_by(client, job) == {"maps.exr", "report.json"}
-    report = client.get(f"/v1/jobs/{solved}/results/report.json").raise_for_status().json()
-    assert report["method"] == "lambert"
-    exported = finish(server, client, submit(client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky))
+    assert report_of(server, client, job)["method"] == "lambert"
+    exported = finished(server, client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky)
     lights = {"asset_lights/rig.usda", "asset_lights/environment.usda", "asset_lights/environment.exr"}
     assert made_by(client, exported) == {"asset.usdz", *lights}
-    rig = client.get(f"/v1/jobs/{exported['id']}/results/asset_lights/rig.usda").raise_for_status()
-    assert rig.content.count(b"def DistantLight") >= 4
+    assert result(client, exported, "asset_lights/rig.usda").count(b"def DistantLight") >= 4
 
 
 @pytest.mark.long
@@ -46,13 +44,13 @@ def test_a_depth_and_views_of_it_of_maps_and_of_a_capture_alone(server, client, 
     assert (job["request"]["name"], job["request"]["options"]["max_residual_px"]) == ("the rig", 2.5)
     finish(server, client, job)
     assert made_by(client, job) == {"depth.exr", "points.ply", "report.json"}
-    exported = finish(server, client, submit(client, kind="export", maps=job["id"], format="usdc", options={"geometry": "points"}))
+    exported = finished(server, client, kind="export", maps=job["id"], format="usdc", options={"geometry": "points"})
     layers = {f"asset_layers/{name}" for name in ("payload.usda", "geometry.usdc", "materials.usda")}
     assert made_by(client, exported) == {"asset.usdc", *layers, "asset_textures/base_color.png"}
     shown = {}
     for name, request in {"maps": {"capture": dome, "maps": solved, "options": {"terms": 4}},
                           "depth": {"capture": rig, "maps": job["id"]}, "capture": {"capture": dome}}.items():
-        view = finish(server, client, submit(client, kind="view", **request))
+        view = finished(server, client, kind="view", **request)
         lit = set() if name == "depth" else {"card_lights.jpg"}
         assert made_by(client, view) == {"view.json", "view.bin", "thumbnails.jpg", "card.jpg"} | lit
         results = f"/v1/jobs/{view['id']}/results"
@@ -69,24 +67,21 @@ def test_a_depth_and_views_of_it_of_maps_and_of_a_capture_alone(server, client, 
 def test_a_relight_guided_by_maps_and_lit_by_keys_and_a_shade_under_near_lights(server, client, dome, solved, sky):
     keys = {"schema": "relit.keys/1", "lights": [{"name": "sun", "keys": [
         {"frame": 3, "direction": [0, 0, 1], "irradiance": [1, 1, 1]}, {"frame": 5, "direction": [0.5, 0, 1], "irradiance": [2, 1, 1]}]}]}
-    job = submit(client, kind="relight", capture=dome, keys=keys, maps=solved, options={"frames": "3-5", "exposure": 1, "aov": ["beauty"]})
-    finish(server, client, job)
+    job = finished(server, client, kind="relight", capture=dome, keys=keys, maps=solved,
+                   options={"frames": "3-5", "exposure": 1, "aov": ["beauty"]})
     assert made_by(client, job) == {"keys.json", "frame.0003.exr", "frame.0004.exr", "frame.0005.exr"}
     lamp = {"position_m": [0, 0, 300], "intensity": [1e5, 1e5, 1e5]}
     for light in (lamp, "0,0,300,1e5,1e5,1e5"):
-        job = submit(client, kind="shade", maps=solved, environment=sky, options={"light": [light], "turn_degrees": 90})
-        finish(server, client, job)
+        job = finished(server, client, kind="shade", maps=solved, environment=sky, options={"light": [light], "turn_degrees": 90})
         assert made_by(client, job) == {"picture.exr"}
 
 
 def test_an_export(server, client, solved):
-    job = submit(client, kind="export", maps=solved, format="usda", options={"name": "dome"})
-    gltf = submit(client, kind="export", maps=solved, format="glb")
-    finish(server, client, job)
-    usda = client.get(f"/v1/jobs/{job['id']}/results/asset.usda").raise_for_status().text
+    job = finished(server, client, kind="export", maps=solved, format="usda", options={"name": "dome"})
+    usda = result(client, job, "asset.usda").decode()
     assert usda.startswith("#usda") and "dome" in usda and "@./asset_layers/payload.usda@" in usda
     assert {"asset.usda", *(f"asset_layers/{name}" for name in ("payload.usda", "materials.usda", "geometry.usdc"))} <= made_by(client, job)
-    finish(server, client, gltf)
+    gltf = finished(server, client, kind="export", maps=solved, format="glb")
     glb = client.get(f"/v1/jobs/{gltf['id']}/results/asset.glb").raise_for_status()
     assert glb.content[:4] == b"glTF" and glb.headers["Content-Type"] == "model/gltf-binary"
 
@@ -117,7 +112,7 @@ def test_jobs_are_listed_a_page_at_a_time_the_newest_first(client, solved):
 @pytest.mark.long
 def test_what_a_job_reads_has_to_be_there_and_ready(server, client, dome, sky, solved, rig):
     receiving = client.post("/v1/captures", json={"name": "to come"}).raise_for_status().json()["id"]
-    waiting = finish(server, client, submit(client, kind="depth", capture=rig))
+    waiting = finished(server, client, kind="depth", capture=rig)
     nowhere, nothing = new_id("cap"), new_id("env")
 
     def ask(**request) -> httpx2.Response:

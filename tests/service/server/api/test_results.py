@@ -25,7 +25,7 @@ from stage.errors import StorageError
 from stage.formats import exr
 from tests.service.server.api.asgi import Call, app_of
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import ENDED, NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import ENDED, NOBODY, finish, finished, made_by, refused, report_of, result, submit
 from tests.service.server.api.test_watch import queue
 from tests.service.server_process import Server
 
@@ -71,16 +71,15 @@ def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
 @pytest.mark.long
 def test_results_name_no_place_of_the_server(server, client, dome, sky):
     """Whoever may read a project need not learn where the server keeps it; captures are named by their identifiers."""
-    job = submit(client, kind="pipeline", capture=dome, environment=sky, guided=True, relight={"frames": "1-2"},
-                 solve={"method": "lambert"})
-    finish(server, client, job)
+    job = finished(server, client, kind="pipeline", capture=dome, environment=sky, guided=True, relight={"frames": "1-2"},
+               solve={"method": "lambert"})
     names = made_by(client, job)
     assert {"report.json", "maps.exr", "frame.0001.exr"} <= names
     for name in names:
-        content = client.get(f"/v1/jobs/{job['id']}/results/{name}").content
+        content = result(client, job, name)
         for place in (str(server.data.parent), str(SAMPLES), os.getcwd()):
             assert place.encode() not in content, (name, place)
-    assert client.get(f"/v1/jobs/{job['id']}/results/report.json").json()["options"]["capture"] == dome
+    assert report_of(server, client, job)["options"]["capture"] == dome
 
 
 @pytest.mark.long

@@ -141,7 +141,6 @@ def test_a_provider_that_is_away(tmp_path, monkeypatch):
         known.caller(token, None)
 
 
-
 def test_a_service_takes_tokens_beside_keys_and_audits_both(issuer, tmp_path):
     with app_of(Settings(data=tmp_path, min_free_bytes=0, oidc_issuer=issuer.url, oidc_grants=GRANTS)) as app:
         def holding(token: str) -> TestClient:

@@ -9,8 +9,7 @@ import pytest
 from service.requests.keys import Scope
 from service.server.base.settings import Settings
 from service.server.database import engine, keys, tables
-from service.server.database.engine import connect
-from service.server.jobs.queue import prepare
+from tests.service.server.prepared import opened
 
 
 @pytest.fixture
@@ -21,11 +20,8 @@ def data(tmp_path):
 @pytest.fixture
 def database(data):
     """The database for the keys that a test makes."""
-    settings = Settings(data=data)
-    made = connect(settings.sqlalchemy_url)
-    prepare(settings, made)
-    yield made
-    made.close()
+    with opened(Settings(data=data)) as made:
+        yield made
 
 
 @pytest.fixture

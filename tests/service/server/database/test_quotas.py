@@ -108,7 +108,6 @@ def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
     assert taken(database, work) == 3
 
 
-
 CALLER = Caller("larch", Scope.WRITE, "key_0123456789abcdefghjk")
 
 

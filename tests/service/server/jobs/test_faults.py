@@ -69,7 +69,6 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         made.made_whole(job, undisturbed)
 
 
-
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
     with harness(tmp_path, max_lost=1, takeover_s=0.2) as made:
         made.start("kill")

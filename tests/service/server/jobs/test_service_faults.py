@@ -35,7 +35,6 @@ def frames_there(server: Server, job: str, count: int) -> None:
     until(lambda: results(server, job).is_dir() and len(list(results(server, job).glob("frame.*"))) >= count, f"{count} frames")
 
 
-
 def assert_workers_are_spawned(server: Server) -> None:
     """Check that the API has no Warp, and that its worker, which has done a job, is no fork of it."""
     commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode() for pid in children_of(server.process.pid)}

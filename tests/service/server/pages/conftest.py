@@ -128,6 +128,15 @@ def page(browser, server: Server):
     assert others == []
 
 
+def alter(page, place: str, change) -> None:
+    """Let `change` alter what the API says at a place."""
+    def answer(route):
+        found = route.fetch()
+        route.fulfill(response=found, json=change(found.json()))
+
+    page.route(place, answer)
+
+
 @pytest.fixture
 def open_to_axe(browser, server: Server):
     """A page whose policy lets axe be injected."""

@@ -1,10 +1,9 @@
 """Names that are markup are shown as text, whoever gave them: environments, results, frames, layers, units and methods."""
 
-import json
 
 import pytest
 
-from tests.service.server.pages.conftest import await_whole, expect, seen
+from tests.service.server.pages.conftest import alter, await_whole, expect, seen
 
 pytestmark = pytest.mark.long
 
@@ -31,15 +30,12 @@ def changed(value, names: set[str]):
 def test_a_name_that_is_markup_is_text(page, solved, place, path, names):
     asked = []
 
-    def answer(route):
-        asked.append(route.request.url)
-        found = route.fetch()
-        value = found.json()
-        told = {**value, "items": [ENVIRONMENT]} if names is None else changed(value, names)
-        route.fulfill(response=found, body=json.dumps(told))
+    def told(value):
+        asked.append(path)
+        return {**value, "items": [ENVIRONMENT]} if names is None else changed(value, names)
 
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
-    page.route(path, answer)
+    alter(page, path, told)
     page.goto({"home": "/", "captures": "/captures", **solved.pages}[place])
     await_whole(page)
     if "report" not in path:

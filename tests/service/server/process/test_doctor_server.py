@@ -8,9 +8,9 @@ from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
 from service.server.base.settings import Settings
 from service.server.database import keys, workers
-from service.server.database.engine import connect
 from service.server.database.schema import REVISIONS
-from service.server.jobs.queue import JobQueue, prepare
+from service.server.jobs.queue import JobQueue
+from tests.service.server.prepared import opened
 from tests.service.server_process import new_key, revoke
 
 
@@ -23,12 +23,9 @@ def data(tmp_path, monkeypatch):
 @pytest.fixture(autouse=True)
 def database(data):
     """The database of a service with one key."""
-    settings = Settings(data=data)
-    made = connect(settings.sqlalchemy_url)
-    prepare(settings, made)
-    new_key(made)
-    yield made
-    made.close()
+    with opened(Settings(data=data)) as made:
+        new_key(made)
+        yield made
 
 
 def lines_of(outcome) -> dict[str, str]:

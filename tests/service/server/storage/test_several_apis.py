@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +16,10 @@ import pytest
 
 from service.server.base.settings import Settings
 from service.server.database import uploads
-from service.server.database.engine import connect
+from service.server.database.engine import Database, connect
 from service.server.storage import upload_parts
 from service.server.storage.objects import open_storage
-from service.server.storage.upload_parts import open_upload_parts
+from service.server.storage.upload_parts import UploadParts, open_upload_parts
 from tests.service.server.api.test_watch import queue
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving
@@ -45,6 +45,14 @@ def site(tmp_path_factory, server_postgres) -> Iterator[Site]:
     options = ("--anonymous", "--device", "none")
     with serving(folder / "one", *options, **settings) as first, serving(folder / "two", *options, **settings) as second:
         yield Site(first, second, folder / "store", settings)
+
+
+@contextmanager
+def third(site: Site) -> Iterator[tuple[Database, UploadParts]]:
+    """The database and the part files of another process on the machine of the first."""
+    settings = Settings(data=site.first.data, **site.settings)
+    with closing(connect(settings.sqlalchemy_url)) as database:
+        yield database, open_upload_parts(settings, database, open_storage(settings))
 
 
 def begun(site: Site, content: bytes, **words: str) -> tuple[str, str]:
@@ -148,38 +156,32 @@ def test_deleted_and_expired_uploads_leave_no_pieces(site):
     with site.second.client() as client:
         client.delete(f"/v1/captures/{capture}").raise_for_status()
     assert pieces(deleted) == pieces(dropped) == []
-    settings = Settings(data=site.first.data, **site.settings)
-    database = connect(settings.sqlalchemy_url)
-    parts = open_upload_parts(settings, database, open_storage(settings))
-    (site.store / "uploads" / "up_orphan").mkdir()
-    (site.store / "uploads" / "up_orphan" / "0").write_bytes(b"x")
-    sent = settings.part_files / "up_orphan-0.part.piece"  # as an API that was killed while it sent this leaves it
-    sent.write_bytes(b"x")
-    row = uploads.find(database, busy.rpartition("/")[2], "default")
-    with closing(parts.open(row)):  # a request adds to it
-        assert one.patch(busy, MIB, CONTENT[MIB:]).status == 423
-        assert parts.expire(time.time() + 60) >= 1
-        assert pieces(expired) == [] and len(pieces(busy)) == 1 and not any((site.store / "uploads" / "up_orphan").glob("*"))
-        assert not sent.exists()
-    assert one.head(expired).status == 404
-    database.close()
+    with third(site) as (database, parts):
+        (site.store / "uploads" / "up_orphan").mkdir()
+        (site.store / "uploads" / "up_orphan" / "0").write_bytes(b"x")
+        sent = (site.first.data / "uploads") / "up_orphan-0.part.piece"  # as an API that was killed while it sent this leaves it
+        sent.write_bytes(b"x")
+        row = uploads.find(database, busy.rpartition("/")[2], "default")
+        with closing(parts.open(row)):  # a request adds to it
+            assert one.patch(busy, MIB, CONTENT[MIB:]).status == 423
+            assert parts.expire(time.time() + 60) >= 1
+            assert pieces(expired) == [] and len(pieces(busy)) == 1 and not any((site.store / "uploads" / "up_orphan").glob("*"))
+            assert not sent.exists()
+        assert one.head(expired).status == 404
 
 
 def test_a_writer_that_was_thought_dead_counts_nothing(site, monkeypatch):
     monkeypatch.setattr(upload_parts, "LEASE_S", -1.0)
     capture, upload = begun(site, CONTENT)
-    settings = Settings(data=site.first.data, **site.settings)
-    database = connect(settings.sqlalchemy_url)
-    parts = open_upload_parts(settings, database, open_storage(settings))
-    identifier = upload.rpartition("/")[2]
-    row = uploads.find(database, identifier, "default")
-    with closing(parts.open(row)) as slow:
-        slow.append([b"x" * MIB])
-        assert Tus(site.second.url).patch(upload, 0, CONTENT[:MIB]).offset == MIB  # its lease is over
-        assert not slow.save(MIB) and not slow.finish()
-    assert Tus(site.first.url).patch(upload, MIB, CONTENT[MIB:]).offset == len(CONTENT)
-    assert stored(site, capture).read_bytes() == CONTENT
-    database.close()
+    with third(site) as (database, parts):
+        identifier = upload.rpartition("/")[2]
+        row = uploads.find(database, identifier, "default")
+        with closing(parts.open(row)) as slow:
+            slow.append([b"x" * MIB])
+            assert Tus(site.second.url).patch(upload, 0, CONTENT[:MIB]).offset == MIB  # its lease is over
+            assert not slow.save(MIB) and not slow.finish()
+        assert Tus(site.first.url).patch(upload, MIB, CONTENT[MIB:]).offset == len(CONTENT)
+        assert stored(site, capture).read_bytes() == CONTENT
 
 
 def test_the_upload_of_an_api_that_was_killed_goes_on_at_another(site, tmp_path):

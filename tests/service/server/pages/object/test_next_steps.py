@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.service.server.pages.conftest import expect, seen
+from tests.service.server.pages.conftest import alter, expect, seen
 
 pytestmark = pytest.mark.long
 
@@ -11,15 +11,6 @@ def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_pa
     """The capture is being checked at first. A button that asks for a job rests while such a job is under way."""
     page, states, submitted = small_page, ["checking", "ready"], []
 
-    def unprepared(route):
-        answer = route.fetch()
-        found = answer.json()
-        route.fulfill(response=answer, json={**found, "jobs": [{**job, "state": "queued"} for job in found["jobs"]]})
-
-    def unseen(route):
-        answer = route.fetch()
-        route.fulfill(response=answer, json={**answer.json(), "view": None, "state": states.pop(0) if states else "ready"})
-
     def submit(route):
         submitted.append(route.request.post_data_json)
         route.fulfill(status=202, json=waiting)
@@ -27,9 +18,11 @@ def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_pa
     with solved.server.client() as client:
         job = client.get(f"/v1/jobs/{solved.solve}").json()
     waiting = {**job, "state": "queued", "request": {"kind": "pipeline", "capture": solved.capture}}
-    page.route("**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", unprepared)
+    alter(page, "**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", lambda found: found | {
+        "jobs": [{**job, "state": "queued"} for job in found["jobs"]]})
     page.route("**/v1/jobs?limit=500&state=succeeded", lambda route: route.fulfill(json={"jobs": [], "next": None}))
-    page.route(f"**/v1/captures/{solved.capture}", unseen)
+    alter(page, f"**/v1/captures/{solved.capture}", lambda capture: capture | {
+        "view": None, "state": states.pop(0) if states else "ready"})
     page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
     page.route("**/v1/events", lambda route: None)
     page.route("**/v1/jobs", submit)
@@ -50,16 +43,12 @@ def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_pa
 def test_maps_are_exported_without_another_solve(small_page, solved):
     page, submitted = small_page, []
 
-    def without_assets(route):
-        answer = route.fetch()
-        found = answer.json()
-        route.fulfill(response=answer, json={**found, "jobs": [job for job in found["jobs"] if job["request"]["kind"] != "export"]})
-
     def submit(route):
         submitted.append(route.request.post_data_json)
         route.fulfill(status=503, json={"detail": "the service takes no jobs now"})
 
-    page.route("**/v1/jobs?limit=500&state=succeeded", without_assets)
+    alter(page, "**/v1/jobs?limit=500&state=succeeded", lambda found: found | {
+        "jobs": [job for job in found["jobs"] if job["request"]["kind"] != "export"]})
     page.route("**/v1/jobs", submit)
     page.goto(f"{solved.pages['object']}#mode=photographs")
     page.get_by_role("button", name="Export an asset").click()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.service.server.pages.axe import assert_accessible
-from tests.service.server.pages.conftest import Solved, await_whole, done, expect, new_context, opened_page, seen, spread_fingers
+from tests.service.server.pages.conftest import Solved, alter, await_whole, done, expect, new_context, opened_page, seen, spread_fingers
 from tests.service.server.pages.frames import picture
 
 pytestmark = pytest.mark.long
@@ -92,14 +92,8 @@ def test_the_link_to_the_content_keeps_what_the_address_says(small_page, made):
 
 def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_mode(small_page, made):
     page = small_page
-
-    def unprepared(route):
-        answer = route.fetch()
-        found = answer.json()
-        found["jobs"] = [{**job, "state": "running"} if job["request"].get("maps") else job for job in found["jobs"]]
-        route.fulfill(response=answer, json=found)
-
-    page.route("**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", unprepared)
+    alter(page, "**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", lambda found: found | {
+        "jobs": [{**job, "state": "running"} if job["request"].get("maps") else job for job in found["jobs"]]})
     page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
     page.goto(f"{made.pages['object']}#mode=photographs")
     page.locator("[data-shows=photographs] figure canvas").first.wait_for()
@@ -127,12 +121,8 @@ def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(
 
 @pytest.mark.parametrize("mode", ["photographs", "light"])
 def test_what_was_taken_for_granted_is_no_fault(page, made, mode):
-    def doubtful(route):
-        answer = route.fetch()
-        doubts = {"findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"], "assumed": ["no lens is known"]}
-        route.fulfill(response=answer, json=answer.json() | doubts)
-
-    page.route("**/results/view.json", doubtful)
+    doubts = {"findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"], "assumed": ["no lens is known"]}
+    alter(page, "**/results/view.json", lambda view: view | doubts)
     page.goto(f"{made.pages['object']}#mode={mode}")
     colours = [page.get_by_text(words, exact=True).evaluate("(each) => getComputedStyle(each).color")
                for words in ("a frame is dark", "the height is steep", "no lens is known")]
@@ -152,13 +142,8 @@ def test_every_slider_has_its_number(page, made):
 
 def test_a_capture_that_an_earlier_build_has_checked_is_offered_what_its_light_allows(page, solved):
     """Its facts do not say what lit its frames; its view has their directions."""
-    def earlier(route):
-        answer = route.fetch()
-        capture = answer.json()
-        del capture["facts"]["lit_by"]
-        route.fulfill(response=answer, json=capture)
-
-    page.route(f"**/v1/captures/{solved.capture}", earlier)
+    alter(page, f"**/v1/captures/{solved.capture}", lambda capture: capture | {
+        "facts": {name: fact for name, fact in capture["facts"].items() if name != "lit_by"}})
     page.goto(solved.pages["capture"])
     expect(page.locator("#next [data-kind]:visible")).to_have_text(["Make an asset", "Solve normals and materials"])
 
