@@ -64,9 +64,13 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
             _hold_adapted(given, sample, solution)
         if found is not None and found.cause not in (Cause.IRRADIANCE, Cause.STEP) and rig is None:
             other = None
-        if other is not None:
-            solution.warnings.append(other.sentence if rig is None else rig.sentence)
+        if other is not None and (other.sentence is not None or solution.specular is None):  # else lobes have been fitted
             raise_error(solution, other.degrees if rig is None else rig.degrees)
+        sentence = None if other is None else other.sentence if rig is None else rig.sentence
+        if sentence is None:
+            other = None
+        else:
+            solution.warnings.append(sentence)
         if estimated:
             fit = fit_manifest(sample._replace(irradiance=lights.irradiance))
     moved = find_placement(given, lights) if isinstance(lights, PlacedLights) else None

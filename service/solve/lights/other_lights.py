@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from kernels.photometric.lambertian.near import NearField, pad_places
+from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import SHADOW, degrees_between, median_of, normal_equations
+from service.solve.base.batches import pick_pixels, view_directions
 from service.solve.base.solution import SolveInput, at_all_pixels
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.height.height import mean_height
@@ -24,7 +27,7 @@ from stage.capture.point_lights import DistantLights, PlacedLights
 
 TRIED_PIXELS = 600
 """Pixels, spread over the object, that are compared."""
-DISTANCES = tuple(np.geomspace(0.8, 50, 19).tolist())
+DISTANCES = tuple(np.geomspace(1.5, 50, 16).tolist())
 """Distances from the middle of the object that are tried, in its half widths, 26 % apart."""
 EVERY, PRECISE = 3, 0.02
 """Every so many of these distances is tried first; then those on both sides of the best one are, and distances between to this part."""
@@ -41,6 +44,9 @@ NEAR = 8.0
 """Half widths below which more gain is asked: of bare metal, lights as near explain more than it is."""
 SURE_NEAR = 2.0
 """Least ratio of the gain of near lights to its standard error over squares of pixels."""
+LEAST_LOBES_GAIN = 0.1
+"""Part of the cost of lobes of one shape that near lights take away, too: 0.15 to 0.95 where lights are near; gloss of round objects under
+distant ones, which Lambert's law takes for the falloff of near ones, costs 1.05 to 70 times as much (100 domes of five to 96 lights)."""
 UNSURE = 0.015
 """Standard error of the inverse of a distance in half widths: of seven path-traced scenes with bounced light and gloss it is off by up to
 0.02, and as much of a real object, whose readings fit best at 16 half widths and its normals at 23."""
@@ -48,6 +54,8 @@ EXPLAINED = 2.5
 """Largest cost of half of the pixels under other lights, that of a residual of three times the noise: on bare metal, which no
 Lambertian fit explains, it is 3.2 and more, and near lights then take up to a quarter away of what they do not explain; on glossy objects
 at most 2."""
+FACING = 0.05
+"""Least z of a normal from which the search for lobes begins."""
 LEAST_FACTOR = 1.2
 """Least factor of the strength of one light: less turns normals by a few degrees."""
 STRENGTH_ROUNDS = 4
@@ -61,7 +69,8 @@ MOST_LEVERAGE = 0.9
 class OtherLights(NamedTuple):
     """Lights that explain the readings much better than those that are declared."""
 
-    sentence: str
+    sentence: str | None
+    """What is wrong with the declared ones; None: Lambert's law alone says so, and lobes do not."""
     gain: float
     """The part of the cost of the readings that they take away."""
     degrees: np.ndarray  # [pixels of the image] float32, angle between the normals under these and under the declared; 0 outside the mask
@@ -134,21 +143,50 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
     sure = SURE if best.ways is None else SURE_NEAR
     if gain < best.least_gain or less.sum() < sure * np.sqrt((less**2).sum()):
         return None
+    pixels = np.flatnonzero(given.mask)[chosen][told]
     turned = degrees_between(far.normal, best.fit.normal)
-    degrees = at_all_pixels(given.mask, np.flatnonzero(given.mask)[chosen][told], turned)
-    rig = None if best.ways is None else _rig_of(given, lights, best.ways, gain, degrees)
+    degrees = at_all_pixels(given.mask, pixels, turned)
+    rig = None
+    if best.ways is not None:
+        placed, median = _placed(given, lights, best.ways)
+        if not _lobes_agree(given, lights, placed, pixels, far, best.fit):
+            return OtherLights(None, gain, degrees)
+        rig = Rig(placed, median, gain, (UNSURE * median * degrees).astype(np.float32))
     return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees, rig)
 
 
-def _rig_of(given: SolveInput, lights: DistantLights, ways: np.ndarray, gain: float, degrees: np.ndarray) -> Rig:
-    """Return the rig whose lights stand so, [lights, 3] half widths from the middle of the object."""
+def _placed(given: SolveInput, lights: DistantLights, ways: np.ndarray) -> tuple[PlacedLights, float]:
+    """Return lights that stand so, [lights, 3] half widths from the middle of the object, and their median distance in these."""
     distance = np.linalg.norm(ways, axis=1, keepdims=True)
-    median = float(np.median(distance))
-    points = given.camera.points(np.full(given.mask.shape, mean_height(given.camera)))[given.mask].astype(np.float64)
+    points = given.camera.points(_plane(given))[given.mask].astype(np.float64)
     half, centre = np.ptp(points[:, :2], axis=0).max() / 2, points.mean(axis=0)
     place = np.concatenate([centre + half * ways, np.ones((len(ways), 1))], axis=1)
-    placed = PlacedLights.about(centre, place, lights.irradiance * (half * distance) ** 2, np.zeros((len(ways), 4)))
-    return Rig(placed, median, gain, (UNSURE * median * degrees).astype(np.float32))
+    return (PlacedLights.about(centre, place, lights.irradiance * (half * distance) ** 2, np.zeros((len(ways), 4))),
+            float(np.median(distance)))
+
+
+def _plane(given: SolveInput) -> np.ndarray:
+    """Return the height of a plane in the place of the object, [rows, cols]."""
+    return np.full(given.mask.shape, mean_height(given.camera), np.float32)
+
+
+def _lobes_agree(given: SolveInput, lights: DistantLights, placed: PlacedLights, pixels: np.ndarray, far: NearFit, near: NearFit) -> bool:
+    """Return whether lobes explain readings better under near lights, too. `pixels`: [n] positions, of which `far` and `near` are fits."""
+    from kernels.photometric.search.lobe_shape import choose_lobe_shape  # for few captures: their import takes a tenth of a second
+    from service.solve.methods.kinds import LOBE_PIXELS
+
+    some, view = evenly(len(pixels), LOBE_PIXELS), view_directions(given.camera)
+    field = NearField(pad_places(placed.place, placed.lobe), np.moveaxis(given.camera.points(_plane(given)), -1, 0).reshape(3, -1))
+
+    def cost(direction: np.ndarray, strength: np.ndarray, fit: NearFit, field: NearField | None) -> float:
+        start = fit.normal[:, some].T.astype(np.float32)
+        start[:, 2] = np.maximum(start[:, 2], FACING)
+        start /= np.linalg.norm(start, axis=1, keepdims=True)
+        samples = pick_pixels(given, pad_lights(direction, strength, given.stack.scale), view, pixels[some], field)
+        return min(choose_lobe_shape(samples, start).tried.values())
+
+    distant = cost(lights.direction, lights.irradiance, far, None)
+    return cost(placed.direction, placed.strength, near, field) <= (1 - LEAST_LOBES_GAIN) * distant
 
 
 def _near(sample: _Sample, directions: np.ndarray) -> Iterator[_Trial]:
