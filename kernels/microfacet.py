@@ -5,7 +5,8 @@ Values are BRDF · n·l, so that a reading (radiance / irradiance) is their sum.
 
 Sources: Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007, equation 33 (distribution); Heitz,
 "Understanding the masking-shadowing function", JCGT 2014, equation 99 (height-correlated masking); Schlick 1994 (Fresnel);
-Burley, "Physically-based shading at Disney", 2012, section 5.3 (diffuse).
+Burley, "Physically-based shading at Disney", 2012, section 5.3 (diffuse); Oren and Nayar, "Generalization of Lambert's reflectance model",
+SIGGRAPH 1994, equation 30 (rough facets).
 """
 
 import warp as wp
@@ -80,10 +81,19 @@ def short_tails(nh: float, alpha: float):
 
 
 @wp.func
-def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> float:
-    """Return π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness `rough` (below 0: Lambert's) times 1 + slope · (1 - n·l)."""
-    retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
-    return nl * (1.0 + slope * (1.0 - nl)) * (1.0 + retro * schlick(nl)) * (1.0 + retro * schlick(nv))
+def faceted(nl: float, nv: float, hv2: float) -> float:
+    """Return cos(φ) sin(α) tan(β) of Oren and Nayar, 0 where light and viewer are on different sides of the normal: by how much a rough
+    matt surface shows the facets that face both. α is the larger of the angles to light and viewer, β the smaller."""
+    return wp.max(2.0 * hv2 - 1.0 - nl * nv, 0.0) / wp.max(wp.max(nl, nv), 1.0e-3)
+
+
+@wp.func
+def diffuse(nl: float, nv: float, hv2: float, form: wp.vec4) -> float:
+    """Return π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness form[0] (below 0: Lambert's) times 1 + form[1] · (1 - n·l) and
+    times 1 + form[3] · `faceted`."""
+    retro = wp.where(form[0] >= 0.0, 2.0 * form[0] * hv2 - 0.5, 0.0)
+    facets = 1.0 + form[3] * faceted(nl, nv, hv2)
+    return nl * (1.0 + form[1] * (1.0 - nl)) * (1.0 + retro * schlick(nl)) * (1.0 + retro * schlick(nv)) * facets
 
 
 @wp.func
@@ -115,9 +125,10 @@ def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: fl
 
 
 @wp.func
-def diffuse_with_slopes(nl: float, nv: float, hv2: float, rough: float, slope: float):
+def diffuse_with_slopes(nl: float, nv: float, hv2: float, form: wp.vec4):
     """Return `diffuse` and its derivatives by nl and nv; all are 0 for a light below the horizon."""
-    retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
+    slope = form[1]
+    retro = wp.where(form[0] >= 0.0, 2.0 * form[0] * hv2 - 0.5, 0.0)
     lit = wp.where(nl > 0.0, 1.0, 0.0)
     u = wp.max(1.0 - nl, 0.0)
     w = wp.max(1.0 - nv, 0.0)
@@ -126,6 +137,12 @@ def diffuse_with_slopes(nl: float, nv: float, hv2: float, rough: float, slope: f
     fall = nl * (1.0 + slope * (1.0 - nl))
     toward = 1.0 + retro * u4 * u
     away = 1.0 + retro * w4 * w
-    by_nl = ((1.0 + slope - 2.0 * slope * nl) * toward - 5.0 * retro * u4 * fall) * away
-    by_nv = 0.0 - fall * toward * 5.0 * retro * w4
-    return lit * fall * toward * away, lit * by_nl, lit * by_nv
+    smooth = fall * toward * away
+    share = faceted(nl, nv, hv2)
+    facets = 1.0 + form[3] * share
+    per = wp.where(share > 0.0, form[3] * smooth, 0.0) / wp.max(wp.max(nl, nv), 1.0e-3)
+    by_nl = ((1.0 + slope - 2.0 * slope * nl) * toward - 5.0 * retro * u4 * fall) * away * facets
+    by_nv = 0.0 - fall * toward * 5.0 * retro * w4 * facets
+    by_nl -= per * (nv + wp.where(nl > nv, share, 0.0))
+    by_nv -= per * (nl + wp.where(nl > nv, 0.0, share))
+    return lit * smooth * facets, lit * by_nl, lit * by_nv

@@ -43,9 +43,9 @@ from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.refine import refine
 from kernels.photometric.search.shared_misfit import UNKNOWN_SHARE
 
-NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
-"""Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A
-roughness below 0 is left out: the lobe of roughness 0 in its place costs least on real objects and has worse normals."""
+NEIGHBOURS = ((-0.15, 0.0, 0.0), (0.15, 0.0, 0.0), (0.0, -0.1, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, -0.15), (0.0, 0.0, 0.15))
+"""Differences in roughness, slope and facets of the shapes that are tried besides the shared one: a material varies by as much over an
+object. A roughness below 0 is left out: the lobe of roughness 0 in its place costs least on real objects and has worse normals."""
 SHAPE_TEMPERATURE, KIND_TEMPERATURE = 0.8, 0.2
 """Softmax temperatures of the averages over shapes, and over the mixture and the single lobe, relative to the best cost: a model whose cost
 is this fraction above the best has 1/e of its weight. Costs of shapes differ by misfit alone, and what it bends cancels in their mean; a
@@ -95,7 +95,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe:
         other = descend(samples, found.best.normal, shape=nearby, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
-    steps = [(nearby.rough - shape.rough, nearby.slope - shape.slope) for nearby in others]
+    steps = [(nearby.rough - shape.rough, nearby.slope - shape.slope, nearby.facets - shape.facets) for nearby in others]
     doubt = doubt_of_shape(np.stack(normals), steps, shape_spread.errors(shared_misfit))
     normal, _ = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
     spread = np.zeros_like(doubt)
@@ -131,9 +131,9 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe:
 
 
 def nearby_shapes(shape: LobeShape) -> list[LobeShape]:
-    """Return the shapes that are tried besides one; Lambert's lobe has no roughness that could differ."""
-    return [replace(shape, rough=shape.rough + rough, slope=shape.slope + slope) for rough, slope in NEIGHBOURS
-            if not rough or shape.rough + rough >= 0]
+    """Return the shapes that are tried besides one; Lambert's lobe has no roughness that could differ, and no facets."""
+    return [replace(shape, rough=shape.rough + rough, slope=shape.slope + slope, facets=max(shape.facets + facets, 0.0))
+            for rough, slope, facets in NEIGHBOURS if (not rough or shape.rough + rough >= 0) and (not facets or shape.facets)]
 
 
 def model_weights(costs: np.ndarray, *, temperature: float) -> np.ndarray:
@@ -144,10 +144,10 @@ def model_weights(costs: np.ndarray, *, temperature: float) -> np.ndarray:
     return np.asarray(weights / weights.sum(axis=0))
 
 
-def doubt_of_shape(normals: np.ndarray, steps: list[tuple[float, float]], errors: tuple[float, float]) -> np.ndarray:
+def doubt_of_shape(normals: np.ndarray, steps: list[tuple[float, ...]], errors: tuple[float, ...]) -> np.ndarray:
     """Return the standard errors in degrees, [n] float32, that normals have because the shape of the lobes is not known exactly.
-    `normals`: [1 + steps, n, 3] unit, under the shape and under others. `steps`: what the others differ by, in roughness or in slope.
-    `errors`: of the shape, in roughness and in slope."""
+    `normals`: [1 + steps, n, 3] unit, under the shape and under others. `steps`: what the others differ by, in roughness, slope or facets.
+    `errors`: of the shape, in each of these."""
     variance = np.zeros(normals.shape[1], np.float32)
     for axis, sigma in enumerate(errors):
         turned = [(_angles(normals[0], other) / step[axis]) ** 2 for other, step in zip(normals[1:], steps, strict=True) if step[axis]]

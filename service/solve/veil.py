@@ -5,8 +5,8 @@ about the same all over an image, and grows with all that the image holds (the v
 parts, and the fits are none the worse for it: over the lights a constant is nearly a normal that faces them. So each pixel is fitted by
 Lambert's law and a part of the mean m of each image, r = b·l + c m, and of the parts c that is taken which pixels of no albedo would have.
 Light of the room and a black level are the same in all images: of one m for all, and of its own for each, the surer is taken.
-What else bends Lambert's law, as rough paint or bounced light, goes with albedo, and the sheen of paint does not: where nothing models it,
-it turns the normals as glare does.
+The facets of rough stone bend Lambert's law otherwise under other normals, and are divided out. What else does, as rough paint or bounced
+light, goes with albedo, and the sheen of paint does not: where nothing models it, it turns the normals as glare does.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,9 @@ import numpy as np
 
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
+from service.solve.base.batches import view_directions
 from service.solve.base.solution import AMBIGUOUS_DEGREES, Solution, SolveInput, at_all_pixels
+from service.solve.methods.kinds import FACETS
 from stage.capture.point_lights import DistantLights
 from stage.spread import MAD_TO_SIGMA, between_blocks, tukey_weights
 
@@ -78,7 +80,8 @@ def find_veil(given: SolveInput, lights: DistantLights, solution: Solution) -> V
     sure = solution.standard_error()[pixels] < AMBIGUOUS_DEGREES
     if len(pixels) < LEAST_PIXELS or sure.mean() < LEAST_SURE or not (lights.irradiance > 0).all():
         return None
-    readings = _read(given, lights, solution.normal, pixels[evenly(len(pixels), PIXELS)])
+    facets = solution.facts.get(FACETS, 0.0)
+    readings = _read(given, lights, solution.normal, pixels[evenly(len(pixels), PIXELS)], facets)
     mean = readings.value.mean(axis=1)
     found = [(fits, *_without_albedo(fits, given.mask.shape[1])) for over in (np.full_like(mean, mean.mean()), mean)
              if len((fits := _fit(readings, over)).pixels) >= LEAST_PIXELS]
@@ -95,12 +98,13 @@ def find_veil(given: SolveInput, lights: DistantLights, solution: Solution) -> V
     return Veil(part, degrees)
 
 
-def _read(given: SolveInput, lights: DistantLights, normal: np.ndarray, pixels: np.ndarray) -> _Readings:
+def _read(given: SolveInput, lights: DistantLights, normal: np.ndarray, pixels: np.ndarray, facets: float) -> _Readings:
     radiance, usable = given.stack.pick_radiance(pixels)
     chosen = evenly(len(radiance), MOST_LIGHTS)
     toward = lights.direction[chosen].astype(np.float64)
     value = np.where(usable[chosen], np.pi * (radiance[chosen] / lights.irradiance[chosen][:, None]).mean(axis=-1), 0)
     cosine = toward @ normal[:, pixels]
+    value /= 1 + facets * faceted(cosine, toward, normal[:, pixels], view_directions(given.camera)(pixels).T)
     lit = usable[chosen] & (cosine > LEAST_COSINE)
     albedo = np.where(lit, value * cosine, 0).sum(axis=0) / np.maximum(np.where(lit, cosine**2, 0).sum(axis=0), 1e-12)
     off = np.abs(value - cosine * albedo)
@@ -108,6 +112,12 @@ def _read(given: SolveInput, lights: DistantLights, normal: np.ndarray, pixels: 
     some = lit.any(axis=0)
     noise[some] = MAD_TO_SIGMA * np.nanmedian(np.where(lit, off, np.nan)[:, some], axis=0)
     return _Readings(pixels, toward, value, lit & (off < np.maximum(FAR * noise, FAR_PART * cosine * albedo)), normal[:, pixels].T)
+
+
+def faceted(cosine: np.ndarray, toward: np.ndarray, normal: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """Return microfacet.faceted, [lights, n], of lights [lights, 3] at normals and views [3, n]; `cosine`: of lights and normals."""
+    facing = np.maximum((normal * view).sum(axis=0), TINY)
+    return np.maximum(toward @ view - cosine * facing, 0) / np.maximum(cosine, facing)
 
 
 def _fit(readings: _Readings, over: np.ndarray) -> _Fits:

@@ -36,8 +36,9 @@ def specular(normal, light, view, alpha, f0, gamma=GGX):
     return np.where(lit, distribution(np.maximum(nh, 1e-6), alpha, gamma) * masking * fresnel / (4 * nv), 0.0)
 
 
-def diffuse(normal, light, view, rough=None, slope=0.0):
-    """BRDF · n·l of the diffuse lobe of albedo one: Lambert's, or Burley's of this roughness, times 1 + slope (1 - n·l)."""
+def diffuse(normal, light, view, rough=None, slope=0.0, facets=0.0):
+    """BRDF · n·l of the diffuse lobe of albedo one: Lambert's, or Burley's of this roughness, times 1 + slope (1 - n·l), and times
+    1 + facets · max(0, cos(φ)) sin(α) tan(β) of Oren and Nayar, by the angles themselves."""
     half = unit(light + view)
     nl = np.maximum((normal * light).sum(-1), 0)
     nv, hv = (normal * view).sum(-1), (half * view).sum(-1)
@@ -45,4 +46,8 @@ def diffuse(normal, light, view, rough=None, slope=0.0):
     if rough is not None:
         grazing = 0.5 + 2 * rough * hv**2
         lobe = lobe * (1 + (grazing - 1) * (1 - nl) ** 5) * (1 + (grazing - 1) * (1 - nv) ** 5)
-    return lobe
+    across = [way - cosine[..., None] * normal for way, cosine in ((light, nl), (view, nv))]
+    turned = (unit(across[0] + 1e-12) * unit(across[1] + 1e-12)).sum(-1)
+    to_light, to_viewer = np.arccos(np.clip(nl, 0, 1)), np.arccos(np.clip(nv, 0, 1))
+    facing = np.maximum(turned, 0) * np.sin(np.maximum(to_light, to_viewer)) * np.tan(np.minimum(to_light, to_viewer))
+    return lobe * (1 + facets * np.where(nl > 0, facing, 0))

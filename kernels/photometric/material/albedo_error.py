@@ -174,7 +174,7 @@ def _sums_kernel(lanes: int) -> Any:
                 nl = wp.max(cosine, 0.0)
                 lobe, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl, nv[k], (cosine + nv[k]) * inverse, alpha[k], view_root[k],
                                                                  view_slope[k])
-                value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv2, criteria.form[0], criteria.form[1])
+                value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv2, criteria.form)
                 fd[k] = INVERSE_PI * value
                 d0[k] = INVERSE_PI * (on_l * la + on_v * va[k])
                 d1[k] = INVERSE_PI * (on_l * lo + on_v * vo[k])

@@ -80,7 +80,7 @@ def direction_lobes(lanes: int) -> Lobes:
             scratch.values[at + wp.static(MIXTURE + 1) * scratch.step] = rise
 
     @wp.func
-    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
+    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
              scratch: scratch_struct):
         vx, vy, vz = vector_at(samples.view, p)
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
@@ -102,7 +102,7 @@ def direction_lobes(lanes: int) -> Lobes:
                 nl[k] = wp.max(cosine, 0.0)
                 nh[k] = (cosine + nv[k]) * inverse[k]
                 fresnel[k] = LOBE_SCALE * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
-                lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
+                lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form)
             scratch.values[at] = lobe
             for a in range(wp.static(len(LOBES))):
                 width = alphas[a]
@@ -123,7 +123,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
 
     @wp.func
-    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type,
+    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type,
                 p: int, scratch: scratch_struct):
         vx, vy, vz = vector_at(samples.view, p)
         nv = lane_type()
@@ -140,7 +140,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
                 nl[k] = wp.max(cosine, 0.0)
                 nh[k] = (cosine + nv[k]) * 0.5 / hv
                 rise[k] = schlick(hv)
-                fd[k] = INVERSE_PI * diffuse(nl[k], nv[k], hv2, form[0], form[1])
+                fd[k] = INVERSE_PI * diffuse(nl[k], nv[k], hv2, form)
             at = p * scratch.pack_stride + light * scratch.light_stride
             scratch.values[at] = fd
             scratch.values[at + 3 * scratch.step] = nl
@@ -168,7 +168,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
             scratch.values[at + 2 * scratch.step] = rise
 
     @wp.func
-    def lambertian(samples: samples_struct, form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
+    def lambertian(samples: samples_struct, form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
         vx, vy, vz = vector_at(samples.view, p)
         above, below, share = lane_type(), lane_type(), lane_type()
         for light in range(samples.light_count):
@@ -178,7 +178,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
                 nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
                 nl = wp.max(nx[k] * wx[k] + ny[k] * wy[k] + nz[k] * wz[k], 0.0)
-                above[k] += nl * diffuse(nl, nv, wp.max(0.5 + 0.5 * lv, 0.0), form[0], form[1])
+                above[k] += nl * diffuse(nl, nv, wp.max(0.5 + 0.5 * lv, 0.0), form)
                 below[k] += nl * nl
         for k in range(lanes):
             share[k] = above[k] / wp.max(below[k], 1.0e-20)

@@ -28,7 +28,7 @@ class Criteria:
 
     noise: wp.vec2  # s0, s1
     shadow: wp.vec2  # r²/σ² of equal cost, depth
-    form: wp.vec3  # diffuse roughness, slope, 1.0 for short tails
+    form: wp.vec4  # diffuse roughness, slope, 1.0 for short tails, facets
 
 
 @wp.func

@@ -72,7 +72,7 @@ def tabulated_lobes(lanes: int, count: Literal[2 + len(SEARCH_WIDTHS), SEARCH_LO
         pass
 
     @wp.func
-    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
+    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
              scratch: scratch_struct):
         vx, vy, vz = vector_at(samples.view, p)
         places = pairs()
@@ -105,7 +105,7 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
     pairs = wp.types.matrix(shape=(2, lanes), dtype=wp.float32)
 
     @wp.func
-    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type,
+    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type,
                 p: int, scratch: scratch_struct):
         places = pairs()
         for k in range(lanes):
@@ -146,7 +146,7 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
             scratch.values[at + 2 * scratch.step] = fixed
 
     @wp.func
-    def lambertian(samples: samples_struct, form: wp.vec3, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
+    def lambertian(samples: samples_struct, form: wp.vec4, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
         one = lane_type()
         for k in range(lanes):
             one[k] = 1.0

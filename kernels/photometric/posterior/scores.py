@@ -109,7 +109,7 @@ def _score_kernel(lanes: int, lobes: Lobes) -> Any:
         x = coefficients()
         for candidate in range(offsets.shape[0]):
             nx, ny, nz = candidates_at(cx, cy, cz, offsets[candidate], vx, vy, vz)
-            fill(samples, table, wp.vec3(), nx, ny, nz, p, scratch)
+            fill(samples, table, wp.vec4(), nx, ny, nz, p, scratch)
             total, lit, bright, bright2, dim, dim2 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             for turn in range(REWEIGHTINGS + 1):
                 g = gram()

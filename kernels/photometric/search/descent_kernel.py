@@ -198,7 +198,7 @@ def descent_kernel(lanes: int) -> Any:
                     lo[k] = ox[k] * lx[k] + oy[k] * ly[k] + oz[k] * lz[k]
                     nl[k] = wp.max(cosine, 0.0)
                     nh[k] = (cosine + nv[k]) * inverse[k]
-                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, criteria.form[0], criteria.form[1])
+                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, criteria.form)
                     f[0, k] = value
                     predicted[k] = x[0, k] * value
                     by_l[k] = x[0, k] * on_l

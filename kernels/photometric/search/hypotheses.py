@@ -40,6 +40,8 @@ class LobeShape:
     """Slope s of a further factor 1 + s · (1 - n·l)."""
     short_tails: bool = False
     """Whether highlights fall off nearly as Beckmann's, and not as those of GGX; see microfacet.short_tails."""
+    facets: float = 0.0
+    """Ratio B/A of Oren and Nayar's lobe of matt facets: .12, .3, .44 and .58 for slopes of 10°, 20°, 30° and 45°."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +84,7 @@ def criteria(options: SearchOptions | None, shape: LobeShape) -> Criteria:
     found = Criteria()
     found.noise = wp.vec2(options.noise_floor, options.noise_slope)
     found.shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
-    found.form = wp.vec3(shape.rough, shape.slope, float(shape.short_tails))
+    found.form = wp.vec4(shape.rough, shape.slope, float(shape.short_tails), shape.facets)
     return found
 
 

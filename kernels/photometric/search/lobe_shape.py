@@ -5,7 +5,8 @@ cannot tell that shape from a tilt of its normal; all pixels together can: the s
 hypothesis search is also the one with the least error of the normals (docs/figures.md). So do they tell whether highlights have the long
 tails of GGX or hardly any, as Beckmann's: no sum of lobes with tails is one without.
 
-Source: the diffuse lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3; choosing its shape by cost is ours.
+Sources: the diffuse lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3, or Oren's and Nayar's, "Generalization of
+Lambert's reflectance model", SIGGRAPH 1994, as of stone, clay and plaster; choosing its shape by cost is ours.
 """
 
 import itertools
@@ -26,7 +27,11 @@ ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
 """Roughnesses of Burley's lobe that are tried; the value below 0 stands for Lambert's lobe."""
 SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
 """Slopes of the lobe's further factor that are tried."""
-ROUGH_STEP, SLOPE_STEP = 0.075, 0.05
+FACETS = (0.2, 0.4, 0.6)
+"""Ratios B/A of Oren's and Nayar's lobe that are tried, with FACET_SLOPES: facets of 14°, 27° and 47°."""
+FACET_SLOPES = (-0.1, 0.0, 0.1)
+"""Slopes of the further factor that are tried with facets."""
+ROUGH_STEP, SLOPE_STEP, FACET_STEP = 0.075, 0.05, 0.1
 """Steps of the second search, about the best shape of the first."""
 FROM_LAMBERT = Schedule(softened=0, judged=7)
 """Descent from the normal and weights found under Lambert's lobe: another shape moves normals by a few degrees."""
@@ -60,16 +65,19 @@ class ShapeSpread(NamedTuple):
     """Standard deviation of the roughness of their diffuse lobes."""
     slope: float
     """That of the slope of the further factor."""
+    facets: float
+    """That of the ratio of facets."""
     rounding: float = ROUNDED
     """Standard error because shapes are tried in steps, of these."""
 
-    def errors(self, shared: float) -> tuple[float, float]:
-        """Return the standard errors of roughness and slope of their mean. `shared`: 0…1, of `shared_misfit`."""
+    def errors(self, shared: float) -> tuple[float, ...]:
+        """Return the standard errors of roughness, slope and facets of their mean. `shared`: 0…1, of `shared_misfit`."""
         part = math.sqrt(min(1.0, SHAPE_SHARE * shared))
-        return math.hypot(part * self.rough, self.rounding * ROUGH_STEP), math.hypot(part * self.slope, self.rounding * SLOPE_STEP)
+        return tuple(math.hypot(part * spread, self.rounding * step)
+                     for spread, step in zip(self[:3], (ROUGH_STEP, SLOPE_STEP, FACET_STEP), strict=True))
 
 
-UNKNOWN_SPREAD = ShapeSpread(0.1, 0.05)
+UNKNOWN_SPREAD = ShapeSpread(0.1, 0.05, 0.1)
 """That of a shape that is not chosen from the object: about the mean of those that are."""
 
 
@@ -105,20 +113,23 @@ def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape 
             first = find_normals(samples, start, shape=LobeShape(short_tails=True), sweep=QUICK).best
     tried: dict[LobeShape, float] = {} if beside is None else {beside: cost_of(beside)}
 
-    def judge(rough: float, slope: float) -> None:
-        shape = LobeShape(rough=round(rough, 4), slope=round(slope, 4), short_tails=short_tails)
+    def judge(rough: float, slope: float, facets: float = 0.0) -> None:
+        shape = LobeShape(rough=round(rough, 4), slope=round(slope, 4), short_tails=short_tails, facets=round(facets, 4))
         if shape not in tried:
             tried[shape] = cost_of(shape)
 
     for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
         judge(rough, slope)
+    for facets, slope in itertools.product(FACETS, FACET_SLOPES):
+        judge(-1.0, slope, facets)
     best = _best(tried)
     for across, along in itertools.product((-1, 0, 1), repeat=2):
         rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * ROUGH_STEP, 0, 1))
-        judge(rough, best.slope + along * SLOPE_STEP)
+        facets = max(best.facets + across * FACET_STEP, 0.0) if best.facets else 0.0
+        judge(rough, best.slope + along * SLOPE_STEP, facets)
     best = _best(tried)
     mean, spread = _average(tried, best)
-    if best.rough < 0 and spread.slope < SLOPE_STEP:
+    if best.rough < 0 and not best.facets and spread.slope < SLOPE_STEP:
         found = minimize_scalar(lambda slope: cost_of(replace(best, slope=slope)), method="bounded", options={"xatol": NARROW * SLOPE_STEP},
                                 bounds=(best.slope - SLOPE_STEP, best.slope + SLOPE_STEP))
         mean = replace(best, slope=round(float(found.x), 4)) if found.fun < tried[best] else best
@@ -129,19 +140,21 @@ def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape 
 def _best(tried: dict[LobeShape, float]) -> LobeShape:
     """Return the shape of least cost, or the best slope of Lambert's lobe where that costs hardly more."""
     best = min(tried, key=tried.__getitem__)
-    lambert = min((shape for shape in tried if shape.rough < 0), key=tried.__getitem__)
+    lambert = min((shape for shape in tried if shape.rough < 0 and not shape.facets), key=tried.__getitem__)
     return lambert if tried[lambert] <= SIMPLER * tried[best] else best
 
 
 def _average(tried: dict[LobeShape, float], best: LobeShape) -> tuple[LobeShape, ShapeSpread]:
-    """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs, and their spread
-    about it."""
-    alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items()
-                      if (shape.rough < 0, shape.short_tails) == (best.rough < 0, best.short_tails)])
-    least = alike[:, 2].min()
-    weights = np.exp(-(alike[:, 2] - least) / max(TEMPERATURE * least, 1e-12))
+    """Return the mean of the shapes of the best one's kind of lobe (Lambert's, Burley's, facets), each weighted by how little it costs, and
+    their spread about it."""
+    def kind(shape: LobeShape) -> tuple[bool, bool, bool]:
+        return shape.rough < 0, shape.facets > 0, shape.short_tails
+
+    alike = np.array([(shape.rough, shape.slope, shape.facets, cost) for shape, cost in tried.items() if kind(shape) == kind(best)])
+    least = alike[:, 3].min()
+    weights = np.exp(-(alike[:, 3] - least) / max(TEMPERATURE * least, 1e-12))
     weights /= weights.sum()
-    mean = weights @ alike[:, :2]
-    rough, slope = np.sqrt(weights @ (alike[:, :2] - mean) ** 2)
-    return LobeShape(rough=round(float(mean[0]), 4), slope=round(float(mean[1]), 4), short_tails=best.short_tails), ShapeSpread(
-        float(rough), float(slope))
+    mean = weights @ alike[:, :3]
+    spread = ShapeSpread(*np.sqrt(weights @ (alike[:, :3] - mean) ** 2).tolist())
+    rough, slope, facets = mean.round(4).tolist()
+    return LobeShape(rough=rough, slope=slope, short_tails=best.short_tails, facets=facets), spread

@@ -39,6 +39,8 @@ ball, another one saved 14 % of the cost."""
 OWN = 0.9
 """Part of the cost under the object's lobe to which one of its own must lower that of a part."""
 
+FACETS = "diffuse_facets"
+"""The name of the ratio of facets in what the report says of a lobe."""
 Read = Callable[[np.ndarray], Samples]
 """A function from positions of pixels to their direct light."""
 READ_AT_ONCE = 4096
@@ -151,8 +153,9 @@ def smoothest(pixels: np.ndarray, normal: np.ndarray, width: int) -> np.ndarray:
 
 
 def lobe_report(lobe: LobeShape) -> dict[str, float | None]:
-    """Return what the report says of lobes: the diffuse one's roughness, None for Lambert's, its slope, and the tails of highlights."""
-    return {"diffuse_roughness": None if lobe.rough < 0 else lobe.rough, "diffuse_slope": lobe.slope, "short_tails": lobe.short_tails}
+    """Return what the report says of lobes: roughness (None for Lambert's), slope and facets of the diffuse one, tails of highlights."""
+    return {"diffuse_roughness": None if lobe.rough < 0 else lobe.rough, "diffuse_slope": lobe.slope, FACETS: lobe.facets,
+            "short_tails": lobe.short_tails}
 
 
 def material_report(materials: np.ndarray) -> list[dict[str, object]]:

@@ -14,7 +14,7 @@ from kernels.photometric.material.material import fit_material
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.model.samples import gather, to_host
 from kernels.photometric.search.hypotheses import LobeShape, search_normals
-from kernels.photometric.search.lobe_shape import ROUGH_STEP, SLOPE_STEP, ShapeSpread, choose_lobe_shape
+from kernels.photometric.search.lobe_shape import FACET_STEP, ROUGH_STEP, SLOPE_STEP, ShapeSpread, choose_lobe_shape
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.svbrdf import average_normals, doubt_of_shape, nearby_shapes, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, store
@@ -32,11 +32,12 @@ def tilted(count: int, largest_degrees: float = 50.0) -> np.ndarray:
     return lattice(count, largest_degrees)
 
 
-def render(normal: np.ndarray, *, albedo=COLOUR, alpha=0.16, f0=0.04, rough=None, slope=0.0, gamma=twin.GGX, lights=LIGHTS) -> np.ndarray:
+def render(normal: np.ndarray, *, albedo=COLOUR, alpha=0.16, f0=0.04, rough=None, slope=0.0, facets=0.0, gamma=twin.GGX,
+           lights=LIGHTS) -> np.ndarray:
     """[3, light, pixel] float64 radiance under unit irradiance."""
     n, light = normal[None], lights[:, None]
     shine = twin.specular(n, light, VIEW, alpha, f0, gamma) if f0 is not None else 0.0
-    matt = twin.diffuse(n, light, VIEW, rough, slope)
+    matt = twin.diffuse(n, light, VIEW, rough, slope, facets)
     return np.stack([channel * matt + shine for channel in albedo])
 
 
@@ -62,25 +63,27 @@ def test_model_agrees_with_the_papers(device):
     light, view = twin.unit(light), twin.unit(view)
     half = twin.unit(light + view)
     alpha, rough, slope = rng.uniform(0.05, 1, 500), rng.uniform(0, 1, 500), rng.uniform(-0.3, 0.2, 500)
+    facets = rng.uniform(0, 0.7, 500)
     rise = (1 - (half * view).sum(-1)) ** 5
 
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate(nl: wp.array(dtype=float), nv: wp.array(dtype=float), nh: wp.array(dtype=float), hv: wp.array(dtype=float),
-                 a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+                 a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float),
+                 f: wp.array(dtype=float), out: wp.array2d(dtype=float)):
         i = wp.tid()
         out[0, i] = ggx(nl[i], nv[i], nh[i], a[i])
-        out[1, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], r[i], s[i])
+        out[1, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], wp.vec4(r[i], s[i], 0.0, f[i]))
         out[2, i] = schlick(hv[i])
-        out[3, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], -1.0, 0.0)
+        out[3, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], wp.vec4(-1.0, 0.0, 0.0, 0.0))
 
-    inputs = [light[:, 2], view[:, 2], half[:, 2], (half * view).sum(-1), alpha, rough, slope]
+    inputs = [light[:, 2], view[:, 2], half[:, 2], (half * view).sum(-1), alpha, rough, slope, facets]
     out = wp.zeros((4, 500), dtype=float, device=device)
     wp.launch(evaluate, dim=500, inputs=[wp.array(v, dtype=float, device=device) for v in inputs], outputs=[out], device=device)
     got = out.numpy()
     lobe = np.array([twin.specular(normal, li, vi, ai, 1.0) for li, vi, ai in zip(light, view, alpha, strict=True)])
     np.testing.assert_allclose(got[0], lobe, rtol=2e-3)
-    burley = [twin.diffuse(normal, li, vi, r, s) for li, vi, r, s in zip(light, view, rough, slope, strict=True)]
-    np.testing.assert_allclose(got[1] / np.pi, burley, rtol=1e-5)
+    matt = [twin.diffuse(normal, *each) for each in zip(light, view, rough, slope, facets, strict=True)]
+    np.testing.assert_allclose(got[1] / np.pi, matt, rtol=1e-5)
     np.testing.assert_allclose(got[2], rise, atol=1e-6)
     np.testing.assert_allclose(got[3], light[:, 2], rtol=1e-6)
 
@@ -195,17 +198,18 @@ def test_perspective_views(device):
     assert np.median(degrees(wrong.normal, normal)) > 0.5  # it matters
 
 
-@pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.5, 0.0), (0.1, -0.2)])
-def test_the_lobe_shape_is_recovered(device, rough, slope):
+@pytest.mark.parametrize(("rough", "slope", "facets"), [(None, 0.0, 0.0), (0.5, 0.0, 0.0), (0.1, -0.2, 0.0), (None, 0.0, 0.44)])
+def test_the_lobe_shape_is_recovered(device, rough, slope, facets):
     """The object as a whole says which diffuse lobe it has; normals gain by it. Half a degree: the shapes tried are 0.075 in
-    roughness and 0.05 in slope apart."""
+    roughness, 0.05 in slope and 0.1 in facets apart."""
     normal = tilted(200, 65.0)
-    samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope), device)
+    samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope, facets=facets), device)
     shape, _, _, tried = choose_lobe_shape(samples, twin.unit(normal + [0.03, 0.02, 0]))
     assert tried[shape] == min(tried.values())
     chosen = degrees(find_normals(samples, normal, shape=shape).best.normal, normal)
     assert np.median(chosen) < 0.5
-    if rough is None:
+    assert shape.facets == pytest.approx(facets, abs=FACET_STEP)
+    if rough is None and not facets:
         assert shape == LobeShape()
     else:
         lambert = degrees(find_normals(samples, normal, shape=LobeShape()).best.normal, normal)
@@ -299,22 +303,23 @@ def test_a_doubtful_shape_turns_normals_by_its_errors():
     0.05 and 0.1 are worth half of the RMS of the former and two thirds of the latter."""
     turned = np.radians([[0.0, 3.0, -5.0, 6.0]])
     normals = np.stack([np.sin(turned), np.zeros_like(turned), np.cos(turned)], axis=-1).swapaxes(0, 1)
-    found = doubt_of_shape(normals, [(0.0, -0.1), (0.0, 0.1), (0.15, 0.0)], (0.1, 0.05))
+    found = doubt_of_shape(normals, [(0.0, -0.1, 0.0), (0.0, 0.1, 0.0), (0.15, 0.0, 0.0)], (0.1, 0.05, 0.1))
     np.testing.assert_allclose(found, np.hypot(np.sqrt(17) / 2, 4), rtol=1e-5)
 
 
 def test_the_error_of_a_mean_shape_is_its_spread_where_misfit_is_shared():
     """Noise that no neighbours share leaves half a step of the search."""
-    spread = ShapeSpread(0.3, 0.2)
-    np.testing.assert_allclose(spread.errors(1.0), np.hypot(spread[:2], np.array([ROUGH_STEP, SLOPE_STEP]) / np.sqrt(12)))
-    assert (np.array(spread.errors(0.0)) < np.array([ROUGH_STEP, SLOPE_STEP]) / 2).all()
+    spread, steps = ShapeSpread(0.3, 0.2, 0.1), np.array([ROUGH_STEP, SLOPE_STEP, FACET_STEP])
+    np.testing.assert_allclose(spread.errors(1.0), np.hypot(spread[:3], steps / np.sqrt(12)))
+    assert (np.array(spread.errors(0.0)) < steps / 2).all()
 
 
 def test_nearby_shapes_are_lobes():
-    """Lambert's lobe varies in slope alone, and no roughness is below 0."""
+    """Lambert's lobe varies in slope alone, with facets in these too, and no roughness is below 0."""
     assert nearby_shapes(LobeShape(slope=-0.1)) == [LobeShape(slope=-0.2), LobeShape(slope=0.0)]
     assert sorted(shape.rough for shape in nearby_shapes(LobeShape(rough=0.1))) == [0.1, 0.1, 0.25]
     assert len(nearby_shapes(LobeShape(rough=0.5))) == 4
+    assert sorted(shape.facets for shape in nearby_shapes(LobeShape(facets=0.1))) == [0.0, 0.1, 0.1, 0.25]
 
 
 @pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.4, -0.1)])

@@ -76,7 +76,7 @@ def test_a_shape_off_by_its_spread_is_held(device):
     normal = tilted(200, 60.0)
     samples, _ = sample(render(normal, rough=0.8, alpha=0.3), device)
     start = twin.unit(normal + [0.03, 0, 0])
-    held, sure = (solve_svbrdf(samples, start, shape=LobeShape(rough=0.4), shared_misfit=shared, shape_spread=ShapeSpread(spread, 0.0))
+    held, sure = (solve_svbrdf(samples, start, shape=LobeShape(rough=0.4), shared_misfit=shared, shape_spread=ShapeSpread(spread, 0.0, 0.0))
                   for shared, spread in ((0.3, 0.4), (0.0, 0.0)))
     error = degrees(held.normal, normal)
     assert np.median(error / sure.sigma) > 3

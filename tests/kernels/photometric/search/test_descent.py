@@ -27,11 +27,12 @@ def test_slopes_are_those_of_the_model(device):
     which counts sixteen times in tails."""
     rng = np.random.default_rng(4)
     nl, nv, nh, hv = rng.uniform(0.05, 1, (4, 400))
-    alpha, rough, slope = rng.uniform(0.1, 1, 400), rng.uniform(0, 1, 400), rng.uniform(-0.3, 0.2, 400)
+    alpha, rough, slope, facets = (rng.uniform(*limits, 400) for limits in ((0.1, 1), (0, 1), (-0.3, 0.2), (0, 0.7)))
 
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate(nl: wp.array(dtype=float), nv: wp.array(dtype=float), nh: wp.array(dtype=float), hv: wp.array(dtype=float),
-                 a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+                 a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float),
+                 f: wp.array(dtype=float), out: wp.array2d(dtype=float)):
         i = wp.tid()
         root = masking_root(nv[i], a[i])
         value, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl[i], nv[i], nh[i], a[i], root, masking_slope(nv[i], a[i], root))
@@ -40,7 +41,7 @@ def test_slopes_are_those_of_the_model(device):
         out[2, i] = by_l
         out[3, i] = by_v
         out[4, i] = by_a2
-        matt, on_l, on_v = diffuse_with_slopes(nl[i], nv[i], hv[i] * hv[i], r[i], s[i])
+        matt, on_l, on_v = diffuse_with_slopes(nl[i], nv[i], hv[i] * hv[i], wp.vec4(r[i], s[i], 0.0, f[i]))
         out[5, i] = matt
         out[6, i] = on_l
         out[7, i] = on_v
@@ -51,7 +52,7 @@ def test_slopes_are_those_of_the_model(device):
         out[10, i] = behind + on_behind
 
     out = wp.zeros((11, 400), dtype=float, device=device)
-    wp.launch(evaluate, dim=400, inputs=[wp.array(v, dtype=float, device=device) for v in (nl, nv, nh, hv, alpha, rough, slope)],
+    wp.launch(evaluate, dim=400, inputs=[wp.array(v, dtype=float, device=device) for v in (nl, nv, nh, hv, alpha, rough, slope, facets)],
               outputs=[out], device=device)
     got = out.numpy()
 
@@ -65,7 +66,8 @@ def test_slopes_are_those_of_the_model(device):
 
     def matt(nl, nv):
         grazing = 2 * rough * hv**2 - 0.5
-        return nl * (1 + slope * (1 - nl)) * (1 + grazing * (1 - nl) ** 5) * (1 + grazing * (1 - nv) ** 5)
+        oren_nayar = 1 + facets * np.maximum(2 * hv**2 - 1 - nl * nv, 0) / np.maximum(nl, nv)
+        return nl * (1 + slope * (1 - nl)) * (1 + grazing * (1 - nl) ** 5) * (1 + grazing * (1 - nv) ** 5) * oren_nayar
 
     for rows, function, at, rounding in ((got[:5], gloss, (nh, nl, nv, alpha**2), 2e-3), (got[5:8], matt, (nl, nv), 2e-3),
                                          (got[8:10], short, (nh,), 3e-2)):

@@ -38,12 +38,12 @@ def test_metals_come_back(device, roughness):
     np.testing.assert_allclose(np.median(found.roughness), roughness, atol=0.003)
 
 
-@pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.5, -0.1)])
-def test_dielectrics_come_back(device, rough, slope):
+@pytest.mark.parametrize(("rough", "slope", "facets"), [(None, 0.0, 0.0), (0.5, -0.1, 0.0), (None, 0.0, 0.44)])
+def test_dielectrics_come_back(device, rough, slope, facets):
     """Albedo, F0 and the diffuse shape beside the lobe; tolerance as above, the lobe being faint."""
     normal = tilted(50, 45.0)
-    shape = LobeShape(rough=-1.0 if rough is None else rough, slope=slope)
-    samples, _ = sample(render(normal, alpha=0.2, f0=0.05, rough=rough, slope=slope), device)
+    shape = LobeShape(rough=-1.0 if rough is None else rough, slope=slope, facets=facets)
+    samples, _ = sample(render(normal, alpha=0.2, f0=0.05, rough=rough, slope=slope, facets=facets), device)
     found = refine(samples, disturbed(normal, 1.0), np.full(50, 0.5), shape=shape)
     assert np.median(degrees(found.normal, normal)) < 0.05
     np.testing.assert_allclose(np.median(found.roughness), np.sqrt(0.2), atol=0.01)
