@@ -23,6 +23,10 @@ STEPS_ACROSS = 60
 """The two pixels of a difference are a thirtieth of the object's size apart: noise matters less than next to each other."""
 LEAST_TOWARD = 0.15
 """Least n_z of a pixel whose slope is used: towards the rim slopes and their noise grow without bound."""
+CHANGING, MANY = 0.2, 95
+"""Places count whose slopes change by this part of what they do at the percentile, LEAST_SITES at the least: within a plane they change by
+noise alone, and of stairs and gears under exchanged axes, which are planes but for their edges, planes made 0.9 of the violation. Under few
+lights, which may turn whole regions, every place counts."""
 STANDARD_ERRORS_MIRROR, STANDARD_ERRORS_TURN = 6.0, 8.0
 """Least difference of the terms in standard errors of their mean. Neighbouring places are not independent: on right captures a mirroring
 is ahead by 2.4 at most (a white bowl under four lights) and behind by 10 to 40 on most; a turn is ahead by 10.7, but below 21 degrees."""
@@ -68,8 +72,8 @@ def sites(mask: np.ndarray) -> np.ndarray:  # -> [4, sites] int64
 def wrong_axes(normals: np.ndarray, *, strict: bool = False) -> Axes | None:
     """Return the mirroring or turn after which the normals fit together clearly better, or None.
 
-    At every place the four sums and differences of the derivatives of the slopes are scaled to the length 1, so that edges and rims
-    count no more than other places. Their mean squares then say how far each rule is broken, and the turn with the least is an
+    At every place where the slopes change, the four sums and differences of their derivatives are scaled to the length 1, so that edges
+    and rims count no more than other places. Their mean squares then say how far each rule is broken, and the turn with the least is an
     eigenvector of a 2 by 2 matrix.
     `normals`: [4, 3, sites] at the pixels of `sites`, z towards the viewer of that pixel. `strict`: ask for more, where few lights gave
     the normals."""
@@ -79,7 +83,10 @@ def wrong_axes(normals: np.ndarray, *, strict: bool = False) -> Axes | None:
     right, left, above, below = (-normals[:, :2] / np.where(good, normals[:, 2:], 1))[:, :, good].astype(np.float64)
     (px, qx), (py, qy) = right - left, above - below
     terms = np.stack([py - qx, px + qy, py + qx, px - qy])
-    terms /= np.maximum(np.sqrt((terms**2).sum(axis=0)), 1e-300)
+    change = np.sqrt((terms**2).sum(axis=0))
+    least = 0.0 if strict else min(CHANGING * np.percentile(change, MANY), np.partition(change, -LEAST_SITES)[-LEAST_SITES])
+    counts = change >= least
+    terms = terms[:, counts] / np.maximum(change[counts], 1e-300)
     turned, turn = _least(terms[:2])
     mirrored, mirror = _least(terms[2:])
     given = terms[0] ** 2

@@ -83,6 +83,11 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
                     f"alike, {fits}; check which light belongs to which image, as by numbers of as many digits (01, 02)",
         Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
                        "light belongs to which image",
+        Cause.BALL_NORMALS: "frames[].light.direction: the directions look like normals of a mirror ball at the spots of the lamps, which "
+                            f"are half way to the viewer: with n taken as 2 (n·v) n - v, {fits}; correct the table, or measure the lights "
+                            "(relit calibrate mirror-ball)",
+        Cause.ELEVATION: "frames[].light.direction: elevations look exchanged with angles from the view axis: with 90° less each of them, "
+                         f"{fits}; correct the table",
         Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
                           "check which light belongs to which image, the directions, and that all have one exposure (camera on manual)",
         Cause.STEADY: f"frames: the images look to share light that is not that of their lamps, {100 * found.part:.0f} % of what a lamp "

@@ -26,6 +26,7 @@ from service.light_estimation.lambertian import (
     unlike_most,
 )
 from service.light_estimation.neighbours import IN_ORDER, MIN_LIGHTS_SMOOTH, SMOOTH, in_order
+from service.light_estimation.other_directions import from_ball_normals, from_other_elevations
 from service.light_estimation.semi_calibrated import ROUND, TINY, fit_intensities, told_by_relief
 from service.light_estimation.steady_light import fit_steady_light
 from stage.colour.colour import GREY_WEIGHTS
@@ -86,6 +87,8 @@ class Cause(Enum):
     REVERSED = "the lights are in reverse order"
     TEXT = "the lights are in the order of their numbers as text, or the images are"
     SHIFTED = "the lights are one frame off"
+    BALL_NORMALS = "the directions are normals of a mirror ball at the spots of the lamps"
+    ELEVATION = "angles from the view axis and elevations are exchanged"
     DIRECTIONS = "directions and images do not belong together"
     STEADY = "light is on in all images that is not that of their lamps"
 
@@ -191,8 +194,8 @@ def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
 
 
 def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
-    """Return the reverse order of the lights, that of text, or one that is a frame off, from an image on if not everywhere, if it explains
-    the images."""
+    """Return the reverse order of the lights, that of text, or one that is a frame off, from an image on if not everywhere, or what else
+    the vectors may be, if it explains the images."""
     if misfit < LEAST_ORDER:
         return None
     numbers, found = np.arange(len(sample.directions)), []
@@ -200,6 +203,10 @@ def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
     for cause, order in ((Cause.REVERSED, numbers[::-1]), (Cause.SHIFTED, np.roll(numbers, 1)), (Cause.SHIFTED, np.roll(numbers, -1)),
                          *((Cause.TEXT, order) for text in texts for order in (text, np.argsort(text)) if (text != numbers).any())):
         fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
+        if _explains(fit.misfit(), misfit, TIMES):
+            found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
+    for cause, directions in ((Cause.BALL_NORMALS, from_ball_normals), (Cause.ELEVATION, from_other_elevations)):
+        fit = fit_manifest(sample._replace(directions=directions(sample.directions)))
         if _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
     if len(numbers) >= MIN_LIGHTS_LATE:

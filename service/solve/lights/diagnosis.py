@@ -27,7 +27,7 @@ from stage.capture.lighting import ExtendedLights
 from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.colour.colour_spaces import is_linear
 
-UNORDERED = (Cause.REVERSED, Cause.TEXT, Cause.SHIFTED, Cause.DIRECTIONS)
+UNORDERED = (Cause.REVERSED, Cause.TEXT, Cause.SHIFTED, Cause.BALL_NORMALS, Cause.ELEVATION, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
 REPAIRED = "; the solve has used the brightness that the images ask for (found.light_intensities)"
 FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].light.position_m",

@@ -46,6 +46,21 @@ def test_the_correction_is_found_up_to_half_a_turn(matrix, undone):
     assert min(np.abs(found.matrix - undone).max(), np.abs(found.matrix + undone).max()) < 0.02
 
 
+@pytest.mark.parametrize("matrix", [np.diag([1, -1, 1]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]])])
+def test_edges_between_planes_tell_axes(matrix):
+    """A pyramid of eleven faces, whose normals have noise of 1.7°: all but some hundred of 2000 places lie within a face."""
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[1:-1:96j, -1:1:96j]
+    ways = np.arange(11) * 2 * np.pi / 11
+    face = np.argmax(np.cos(ways)[:, None, None] * x + np.sin(ways)[:, None, None] * y, axis=0)
+    normal = np.stack([0.6 * np.cos(ways[face]), 0.6 * np.sin(ways[face]), np.ones_like(x)]).reshape(3, -1)
+    normal = normal / np.linalg.norm(normal, axis=0) + 0.03 * rng.normal(size=normal.shape)
+    whole = np.ones(x.shape, bool)
+    assert wrong_axes(at_sites(normal, whole)) is None
+    found = wrong_axes(at_sites(matrix @ normal, whole))
+    assert min(np.abs(found.matrix - matrix[:2, :2]).max(), np.abs(found.matrix + matrix[:2, :2]).max()) < 0.02
+
+
 def test_half_a_turn_cannot_be_seen():
     assert wrong_axes(at_sites(np.diag([-1, -1, 1]) @ NORMAL)) is None
 
@@ -65,14 +80,13 @@ def test_a_round_paraboloid_mirrored_is_a_saddle_which_fits_as_well():
 
 
 def test_few_lights_ask_for_more():
-    """Noisy normals fit a mirroring better, but not well."""
+    """Noisy normals fit a mirroring better, but not well where all places count."""
     mirrored = at_sites(np.diag([1, -1, 1]) @ NORMAL)
     assert wrong_axes(mirrored, strict=True) is not None
     rng = np.random.default_rng(1)
     spoilt = mirrored + [[[0], [0], [0]]]
     spoilt[:, :2] += 0.06 * rng.normal(size=spoilt[:, :2].shape)
-    found = wrong_axes(spoilt)
-    assert found is not None and found.left > 0.1
+    assert wrong_axes(spoilt) is not None
     assert wrong_axes(spoilt, strict=True) is None
 
 

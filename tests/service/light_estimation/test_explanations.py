@@ -116,6 +116,18 @@ def test_lights_or_images_in_the_order_of_their_numbers_as_text_are_named(table)
     assert found.cause is Cause.TEXT and "by their numbers as text" in explanation_sentence(found, sample)
 
 
+@pytest.mark.parametrize(("cause", "words"), [(Cause.BALL_NORMALS, "normals of a mirror ball"),
+                                              (Cause.ELEVATION, "elevations look exchanged")])
+def test_a_table_of_other_vectors_is_named(cause, words):
+    """A glossy ball under lights whose table holds the bisector of each and the viewer, or 90° less its elevation."""
+    readings, lights = ball(0.05)
+    across = np.hypot(lights[:, 0], lights[:, 1])[:, None]
+    table = unit(lights + VIEW) if cause is Cause.BALL_NORMALS else np.hstack([lights[:, :2] / across * lights[:, 2:], across])
+    sample = sample_of(readings, table)
+    found = better_explanation(sample, fit_manifest(sample))
+    assert found.cause is cause and words in explanation_sentence(found, sample)
+
+
 @pytest.mark.parametrize(("count", "room", "window"), [(8, 0.3, 0.5), (8, 0.15, 0.0), (24, 0.3, 0.8)])
 def test_light_of_the_room_is_told_by_what_lamps_do_not_reach(count, room, window):
     """A glossy ball under 8 to 24 lights, in a room that gives a part of a lamp's light, from above more than from below. Rough sheen,
