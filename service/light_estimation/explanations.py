@@ -205,9 +205,9 @@ def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
         fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
         if _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
-    for cause, directions in ((Cause.BALL_NORMALS, from_ball_normals), (Cause.ELEVATION, from_other_elevations)):
-        fit = fit_manifest(sample._replace(directions=directions(sample.directions)))
-        if _explains(fit.misfit(), misfit, TIMES):
+    for cause, other in ((Cause.BALL_NORMALS, from_ball_normals), (Cause.ELEVATION, from_other_elevations)):
+        fit = fit_manifest(sample._replace(directions=other(sample.directions)))
+        if len(numbers) >= MIN_LIGHTS_FREE and fit.apart.mean() >= ROUND and _explains(fit.misfit(), misfit, TIMES):
             found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
     if len(numbers) >= MIN_LIGHTS_LATE:
         late = _late(sample)

@@ -83,6 +83,23 @@ def test_lights_that_differ_are_no_step(change):
     assert found is None or found.cause is not Cause.STEP
 
 
+@pytest.mark.parametrize(("matt", "alpha"), [(0.15, 0.36), (0.3, 0.25)])
+def test_rings_of_a_dome_before_glossy_planes_are_no_step(matt, alpha):
+    """A gear of satin under three rings of lights, one after another: each of its planes shines under other lights, which looks like a step
+    of brightness that leaves the readings further off."""
+    rings = [np.radians([[up, turn + 360 * number / count] for number in range(count)])
+             for up, count, turn in ((25, 12, 0), (45, 8, 10), (68, 4, 30))]
+    up, around = np.concatenate(rings).T
+    lights = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=1)
+    planes = np.repeat([[0.5, -0.43, 0.75], [0.0, 0.87, 0.5], [-0.87, -0.25, 0.43]], [430, 85, 85], axis=0)
+    draw = np.random.default_rng(2)
+    normal = unit(planes + 0.01 * draw.normal(size=planes.shape))
+    shine = np.stack([specular(normal, light, VIEW, alpha, 0.05) for light in lights])
+    readings = (shine + matt / np.pi * np.maximum(lights @ normal.T, 0)) * (1 + 0.005 * draw.normal(size=shine.shape))
+    sample = sample_of(readings, lights)
+    assert better_explanation(sample, fit_manifest(sample)) is None
+
+
 def test_a_step_among_lights_that_all_differ_is_not_all_of_it():
     """Lamps from the middle of the table on are weaker, and all are the weaker the lower they stand, which the step leaves."""
     readings, lights = ball(0.0)
