@@ -28,6 +28,8 @@ FEW_PART = 0.1
 image."""
 SAMPLE = 1 << 20
 """About as many values of a larger image are looked at in each direction."""
+WIDENS = 1.5
+"""The factor by which the range of values near zero is widened where few lie in it."""
 SHRINKS = 0.9
 """The range of values near zero is shrunk again while it becomes shorter than this part."""
 STRIDE = 3
@@ -114,20 +116,28 @@ def _is_plain_half(pixels: np.ndarray) -> bool:
 def _noise_near_zero(values: np.ndarray, most: float) -> float:
     """Return the standard deviation of the noise around zero of values, [rows, cols] float32; 0 where too few are there.
 
-    The range of values that count as near zero begins at ±most, and shrinks to that which the noise explains.
+    The range of values that count as near zero begins at ±most, and shrinks to that which the noise explains. Where few are so dark, as in
+    a narrow shadow, it is wider, up to FEW_PART of the brightest value: brighter values have no less noise.
     """
+    brightest, count, noise = float(values.max()), 0, 0.0
     while True:
         differences = _second_differences(values, most)
-        if len(differences) < MIN_TRIPLES:
-            return 0.0
-        kept = int(KEPT_PART * len(differences))
-        noise = float(np.partition(differences, kept)[:kept].mean(dtype=np.float64)) / MEAN_OF_KEPT / math.sqrt(6)
-        if not 0 < NOISE_SIGMAS * noise < SHRINKS * most:
-            if len(differences) >= MANY_TRIPLES:
-                return noise
-            larger = noise * (1 + 2 * TRIPLES_ERROR / math.sqrt(len(differences)))
-            return larger if NOISE_SIGMAS * larger <= FEW_PART * float(values.max()) else 0.0
-        most = NOISE_SIGMAS * noise
+        if len(differences) >= MIN_TRIPLES:
+            count, kept = len(differences), int(KEPT_PART * len(differences))
+            noise = float(np.partition(differences, kept)[:kept].mean(dtype=np.float64)) / MEAN_OF_KEPT / math.sqrt(6)
+            if not 0 < NOISE_SIGMAS * noise < SHRINKS * most:
+                break
+            most = NOISE_SIGMAS * noise
+        elif count:
+            break
+        else:
+            most *= WIDENS
+            if most > FEW_PART * brightest:
+                return 0.0
+    if count >= MANY_TRIPLES:
+        return noise
+    larger = noise * (1 + 2 * TRIPLES_ERROR / math.sqrt(count))
+    return larger if NOISE_SIGMAS * larger <= FEW_PART * brightest else 0.0
 
 
 def _second_differences(values: np.ndarray, most: float) -> np.ndarray:

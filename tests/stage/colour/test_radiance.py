@@ -82,6 +82,21 @@ def test_noise_in_one_small_shadow_is_kept_and_a_pedestal_is_not(size):
         check_radiance("a.exr", pixels)
 
 
+def test_noise_in_a_shadow_of_few_pixels_is_kept():
+    """A relief that fills the image: all is shaded, and eight pixels are dark. A pixel 20 σ below zero is no noise, nor is ringing."""
+    random = np.random.default_rng(3)
+    shaded = np.repeat(np.linspace(0.02, 0.8, 200, dtype=np.float32)[None, :, None], 200, axis=0).repeat(3, axis=2)
+    shaded[7:11, 60:62] = 0
+    for _ in range(10):
+        noisy = shaded + random.normal(scale=SIGMA, size=shaded.shape).astype(np.float32)
+        check_radiance("a.exr", noisy)
+    noisy[7, 61] = -20 * SIGMA
+    shaded[7:11, 60:62] = -0.02
+    for wrong in (noisy, shaded):
+        with pytest.raises(ImageError, match="negative"):
+            check_radiance("a.exr", wrong)
+
+
 @pytest.mark.parametrize("spoil", ["pedestal", "hot pixel", "ringing"])
 def test_what_no_noise_explains_is_refused_and_counted(spoil):
     pixels = dark_subtracted()
