@@ -74,6 +74,15 @@ def test_a_lamp_that_did_not_change_is_said(relit, tmp_path):
     assert "at one place" not in relit.done("calibrate", "mirror-ball", write(tmp_path / "near", images), "--ball", CIRCLE).out
 
 
+def test_soft_boxes_near_each_other_are_two(relit, tmp_path):
+    """Of 30°, 1.8° apart, which is a fifth of what their spots spread by, as two places of a box that is held by hand."""
+    images = list(mirror_images())
+    beside = DIRECTIONS[1] + [0.0, 0.033, 0.0]
+    for number, way in ((1, DIRECTIONS[1]), (3, beside / np.linalg.norm(beside))):
+        images[number] = render(mirror_of_far(way, degrees=15), **GEOMETRY)[0]
+    assert "at one place" not in relit.done("calibrate", "mirror-ball", write(tmp_path / "ball", images), "--ball", CIRCLE).out
+
+
 @pytest.mark.long
 def test_radii_that_are_exchanged_are_said_and_held_by_sigma(relit, tmp_path):
     """Two balls stand before a perspective camera. Positions were off by up to 21 times what was stated."""
