@@ -38,6 +38,9 @@ RIVAL_PEAK = 0.5
 """The peak of that other spot, relative to the peak, above which it may as well be the lamp."""
 STILL_SHARE = 0.5
 """The part of the light of a spot which all frames show there, above which the spot is none of the lamp of the frame."""
+BRIGHTER = 1.5
+"""The least ratio of such a peak to all that stands still, where nothing else tells a spot: edges that move, as of a disc, are no brighter
+than it."""
 LEAST_MOVING = 0.05
 """The least peak of a spot beside one that stands still, relative to the peak of that: less is noise at its border."""
 SMALL_SPOT = 4
@@ -84,8 +87,17 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     clipped = looked_at & saturated if saturated is not None else np.zeros_like(looked_at)
     if clipped.any():
         value[clipped] = value.max()
-    regions = _regions(value, looked_at, level)
-    rests = still is not None and float(np.minimum(still, value)[regions.spot].sum()) > STILL_SHARE * float(value[regions.spot].sum())
+    rests = False
+    try:
+        regions = _regions(value, looked_at, level)
+    except CalibrationError:  # half of a ball on a table may mirror the table: what stands still is as bright as the lamp
+        moving = value if still is None else np.maximum(value - still, 0)
+        other = None if still is None else _regions_of_another(moving, looked_at, level, least=LEAST_MOVING * float(value.max()))
+        if other is None or still is None or value[other.spot].max() < BRIGHTER * still[looked_at].max():
+            raise
+        value, regions = moving, other
+    else:
+        rests = still is not None and float(np.minimum(still, value)[regions.spot].sum()) > STILL_SHARE * float(value[regions.spot].sum())
     most = max(MAX_SPOT_SHARE * int(view.inside.sum()), SMALL_SPOT)
     if still is not None and rests:
         moving, clipped = np.maximum(value - still, 0), clipped & np.isfinite(still)
