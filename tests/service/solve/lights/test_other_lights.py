@@ -74,6 +74,20 @@ def test_nothing_is_said_of_right_lights(relit, tmp_path, lights, gloss):
     assert "look near" not in said and "as bright as declared" not in said
 
 
+@first_short(("rough", "f0", "albedo"), [(0.6, 0.05, 0.3), (0.5, 0.05, 0.05), (0.7, 0.8, 0.0)])
+def test_gloss_of_a_round_object_does_not_look_lit_from_near(relit, tmp_path, rough, f0, albedo):
+    """Lambert's law alone takes a quarter and more of the cost away with near lights; lobes cost four times as much under them."""
+    surface, toward = dome(40), sphere_directions(24)
+    toward = toward[toward[:, 2] > 0.15]
+    shown = np.array([microfacet.specular(surface.normal, way, VIEW, rough**2, f0) + albedo / np.pi * np.maximum(surface.normal @ way, 0)
+                      for way in toward])
+    shown = np.maximum(shown * (1 + RNG.normal(0, 0.01, shown.shape)), 0)[..., None] * surface.mask[..., None]
+    irradiance = np.ones((len(toward), 3))
+    scene = Scene(surface.normal, np.full((40, 40, 3), albedo), surface.mask, toward, irradiance, np.repeat(shown, 3, axis=-1))
+    _, _, said, found = solve(relit, tmp_path, scene)
+    assert found is None and "look near" not in said
+
+
 @pytest.mark.long
 def test_bare_metal_under_distant_lights_does_not_look_lit_from_near(relit, tmp_path):
     """No Lambertian fit explains it, whichever lights; near ones take a tenth off what they leave."""
