@@ -27,7 +27,7 @@ from stage.capture.point_lights import DistantLights, PlacedLights
 
 TRIED_PIXELS = 600
 """Pixels, spread over the object, that are compared."""
-DISTANCES = tuple(np.geomspace(1.5, 50, 16).tolist())
+DISTANCES = tuple(np.geomspace(0.8, 50, 19).tolist())
 """Distances from the middle of the object that are tried, in its half widths, 26 % apart."""
 EVERY, PRECISE = 3, 0.02
 """Every so many of these distances is tried first; then those on both sides of the best one are, and distances between to this part."""
@@ -44,9 +44,10 @@ NEAR = 8.0
 """Half widths below which more gain is asked: of bare metal, lights as near explain more than it is."""
 SURE_NEAR = 2.0
 """Least ratio of the gain of near lights to its standard error over squares of pixels."""
-LEAST_LOBES_GAIN = 0.1
+LEAST_LOBES_GAIN, CLOSE, LEAST_LOBES_GAIN_CLOSE = 0.1, 1.5, 0.3
 """Part of the cost of lobes of one shape that near lights take away, too: 0.15 to 0.95 where lights are near; gloss of round objects under
-distant ones, which Lambert's law takes for the falloff of near ones, costs 1.05 to 70 times as much (100 domes of five to 96 lights)."""
+distant ones, which Lambert's law takes for the falloff of near ones, costs 1.05 to 70 times as much (200 domes of five to 96 lights). Bare rough metal under few lights costs 0.2 less with lights within so many
+half widths."""
 UNSURE = 0.015
 """Standard error of the inverse of a distance in half widths: of seven path-traced scenes with bounced light and gloss it is off by up to
 0.02, and as much of a real object, whose readings fit best at 16 half widths and its normals at 23."""
@@ -149,7 +150,8 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
     rig = None
     if best.ways is not None:
         placed, median = _placed(given, lights, best.ways)
-        if not _lobes_agree(given, lights, placed, pixels, far, best.fit):
+        least = LEAST_LOBES_GAIN_CLOSE if median < CLOSE else LEAST_LOBES_GAIN
+        if _lobes_gain(given, lights, placed, pixels, far, best.fit) < least:
             return OtherLights(None, gain, degrees)
         rig = Rig(placed, median, gain, (UNSURE * median * degrees).astype(np.float32))
     return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees, rig)
@@ -170,8 +172,8 @@ def _plane(given: SolveInput) -> np.ndarray:
     return np.full(given.mask.shape, mean_height(given.camera), np.float32)
 
 
-def _lobes_agree(given: SolveInput, lights: DistantLights, placed: PlacedLights, pixels: np.ndarray, far: NearFit, near: NearFit) -> bool:
-    """Return whether lobes explain readings better under near lights, too. `pixels`: [n] positions, of which `far` and `near` are fits."""
+def _lobes_gain(given: SolveInput, lights: DistantLights, placed: PlacedLights, pixels: np.ndarray, far: NearFit, near: NearFit) -> float:
+    """Return the part of the cost of lobes that near lights take away. `pixels`: [n] positions, of which `far` and `near` are fits."""
     from kernels.photometric.search.lobe_shape import choose_lobe_shape  # for few captures: their import takes a tenth of a second
     from service.solve.methods.kinds import LOBE_PIXELS
 
@@ -186,7 +188,7 @@ def _lobes_agree(given: SolveInput, lights: DistantLights, placed: PlacedLights,
         return min(choose_lobe_shape(samples, start).tried.values())
 
     distant = cost(lights.direction, lights.irradiance, far, None)
-    return cost(placed.direction, placed.strength, near, field) <= (1 - LEAST_LOBES_GAIN) * distant
+    return 1 - cost(placed.direction, placed.strength, near, field) / max(distant, 1e-12)
 
 
 def _near(sample: _Sample, directions: np.ndarray) -> Iterator[_Trial]:
