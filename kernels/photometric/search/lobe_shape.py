@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.search.descent import Schedule, descend
@@ -54,8 +53,11 @@ is noise, which the pixels average, and their shape is known better than costs o
 
 ROUNDED = 1 / math.sqrt(12)
 """Standard error, in steps of the second search, of a shape on its grid."""
-NARROW = 0.1
-"""Tolerance, in such steps, of the slope of Lambert's lobe where costs tell it: half a step turns the normals of a clean object by 0.2°."""
+HALVES = (0.5, 0.25, 0.125)
+"""Parts of a step by which the slope of Lambert's lobe is moved to either side where costs tell it: half a step turns the normals of a
+clean object by 0.2°."""
+NARROW = ROUNDED / 4
+"""Standard error, in steps, of a slope that was found so."""
 
 
 class ShapeSpread(NamedTuple):
@@ -130,9 +132,12 @@ def choose_lobe_shape(samples: Samples, start: np.ndarray, *, beside: LobeShape 
     best = _best(tried)
     mean, spread = _average(tried, best)
     if best.rough < 0 and not best.facets and spread.slope < SLOPE_STEP:
-        found = minimize_scalar(lambda slope: cost_of(replace(best, slope=slope)), method="bounded", options={"xatol": NARROW * SLOPE_STEP},
-                                bounds=(best.slope - SLOPE_STEP, best.slope + SLOPE_STEP))
-        mean = replace(best, slope=round(float(found.x), 4)) if found.fun < tried[best] else best
+        mean, least = best, tried[best]
+        for part in HALVES:
+            for slope in (mean.slope - part * SLOPE_STEP, mean.slope + part * SLOPE_STEP):
+                cost = cost_of(between := replace(best, slope=round(slope, 4)))
+                if cost < least:
+                    mean, least = between, cost
         spread = spread._replace(rounding=NARROW)
     return Shapes(best, mean, spread, tried)
 

@@ -46,8 +46,8 @@ SURE_NEAR = 2.0
 """Least ratio of the gain of near lights to its standard error over squares of pixels."""
 LEAST_LOBES_GAIN, CLOSE, LEAST_LOBES_GAIN_CLOSE = 0.1, 1.5, 0.3
 """Part of the cost of lobes of one shape that near lights take away, too: 0.15 to 0.95 where lights are near; gloss of round objects under
-distant ones, which Lambert's law takes for the falloff of near ones, costs 1.05 to 70 times as much (200 domes of five to 96 lights). Of bare rough metal under few lights they take 0.2 with lights within so
-many half widths."""
+distant ones, which Lambert's law takes for the falloff of near ones, costs 1.05 to 70 times as much (200 domes of five to 96 lights). Of
+bare rough metal under few lights they take 0.2 with lights within so many half widths."""
 UNSURE = 0.015
 """Standard error of the inverse of a distance in half widths: of seven path-traced scenes with bounced light and gloss it is off by up to
 0.02, and as much of a real object, whose readings fit best at 16 half widths and its normals at 23."""

@@ -218,8 +218,8 @@ def test_the_lobe_shape_is_recovered(device, rough, slope, facets):
 
 @pytest.mark.parametrize("slope", [-0.13, 0.025])
 def test_a_slope_between_those_tried_is_found(device, slope):
-    """A parabola through three costs finds it to a fifth of a step of .05: measured is up to .14. The nearest slope that is tried is .4 and
-    .5 off, and turns normals by .2 degrees in place of .02."""
+    """Halving the step thrice finds it to a sixteenth of a step of .05. The nearest slope of the grid is .4 and .5 steps off, and turns
+    normals by .2 degrees in place of .02."""
     normal = tilted(200, 65.0)
     samples, _ = sample(render(normal, f0=None, slope=slope), device)
     _, mean, spread, _ = choose_lobe_shape(samples, twin.unit(normal + [0.03, 0.02, 0]))
