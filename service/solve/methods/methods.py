@@ -125,5 +125,6 @@ METHODS: Mapping[Method, MethodEntry] = {
 
 
 def solve_in_rig(given: SolveInput, lights: PlacedLights, method: Method) -> Solution:
-    """Solve under lights so far from the object that svbrdf needs no rounds: the surface of `robust` says where its points are."""
+    """Solve under lights at a distance that the images show, which is not known well enough for svbrdf to need more than one round on the
+    surface of `robust`."""
     return _solve_material_in_rig(given, lights) if method is Method.SVBRDF else METHODS[method].solvers[PlacedLights](given, lights)
