@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from kernels.photometric.lambertian.near import NearField, pad_places
+from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.explanations import grey_readings
@@ -23,6 +23,7 @@ from service.solve.base.batches import pick_pixels, view_directions
 from service.solve.base.solution import SolveInput, at_all_pixels
 from service.solve.height.distance import SQUARES, SURE, Lamps, NearFit, cost_of, fit_near
 from service.solve.height.height import mean_height
+from service.solve.methods.near import field_on
 from stage.capture.point_lights import DistantLights, PlacedLights
 
 TRIED_PIXELS = 600
@@ -150,8 +151,8 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
     rig = None
     if best.ways is not None:
         placed, median = _placed(given, lights, best.ways)
-        least = LEAST_LOBES_GAIN_CLOSE if median < CLOSE else LEAST_LOBES_GAIN
-        if _lobes_gain(given, lights, placed, pixels, far, best.fit) < least:
+        asked = LEAST_LOBES_GAIN_CLOSE if median < CLOSE else LEAST_LOBES_GAIN
+        if _lobes_gain(given, lights, placed, pixels, far, best.fit) < asked:
             return OtherLights(None, gain, degrees)
         rig = Rig(placed, median, gain, (UNSURE * median * degrees).astype(np.float32))
     return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees, rig)
@@ -178,7 +179,7 @@ def _lobes_gain(given: SolveInput, lights: DistantLights, placed: PlacedLights, 
     from service.solve.methods.kinds import LOBE_PIXELS
 
     some, view = evenly(len(pixels), LOBE_PIXELS), view_directions(given.camera)
-    field = NearField(pad_places(placed.place, placed.lobe), np.moveaxis(given.camera.points(_plane(given)), -1, 0).reshape(3, -1))
+    field = field_on(given, placed, _plane(given))
 
     def cost(direction: np.ndarray, strength: np.ndarray, fit: NearFit, field: NearField | None) -> float:
         start = fit.normal[:, some].T.astype(np.float32)

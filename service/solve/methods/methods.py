@@ -61,12 +61,6 @@ def _solve_material(given: SolveInput, lights: Lights, field: NearField | None =
     return _with_highlights(given, lights, field, solve_material)
 
 
-def _solve_material_in_rig(given: SolveInput, lights: PlacedLights) -> Solution:
-    from service.solve.methods.material import solve_material
-
-    return solve_once(given, lights, ROBUST, partial(solve_material, once=True))
-
-
 def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
     from service.solve.methods.material import refine_material
 
@@ -127,4 +121,8 @@ METHODS: Mapping[Method, MethodEntry] = {
 def solve_in_rig(given: SolveInput, lights: PlacedLights, method: Method) -> Solution:
     """Solve under lights at a distance that the images show, which is not known well enough for svbrdf to need more than one round on the
     surface of `robust`."""
-    return _solve_material_in_rig(given, lights) if method is Method.SVBRDF else METHODS[method].solvers[PlacedLights](given, lights)
+    if method is not Method.SVBRDF:
+        return METHODS[method].solvers[PlacedLights](given, lights)
+    from service.solve.methods.material import solve_material
+
+    return solve_once(given, lights, ROBUST, partial(solve_material, once=True))

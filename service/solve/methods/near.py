@@ -58,7 +58,6 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     the solution's facts say how many there were and how far the last one moved the surface."""
     camera, mask = given.camera, given.mask
     padded = pad_lights(lights.direction, lights.strength, given.stack.scale)
-    places = pad_places(lights.place, lights.lobe)
     height = np.full(mask.shape, mean_height(camera), dtype=np.float32)
     rounds: dict[str, int] = {}
     solution = Solution.empty(mask.size)
@@ -66,8 +65,7 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     for method, solver, most, refine in series:
         least, idle = np.inf, 0
         for number in range(1, most + 1):
-            points = np.moveaxis(camera.points(height), -1, 0).reshape(3, -1)
-            field = NearField(places, points)
+            field = field_on(given, lights, height)
             solution = solver(given, padded, field) if number == 1 or refine is None else refine(given, padded, field, solution)
             mark_not_facing(camera, solution)
             solved = (solution.status == Status.OK).reshape(mask.shape)
@@ -96,15 +94,18 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     return solution
 
 
+def field_on(given: SolveInput, lights: PlacedLights, height: np.ndarray) -> NearField:
+    """Return the lights as the points of a surface see them, whose height is [rows, cols], z in the camera's frame."""
+    return NearField(pad_places(lights.place, lights.lobe), np.moveaxis(given.camera.points(height), -1, 0).reshape(3, -1))
+
+
 def solve_once(given: SolveInput, lights: PlacedLights, first: Rounds, solver: NormalSolver) -> Solution:
     """Solve every pixel of the mask under lights that are near, once, on the surface on which the `first` rounds have settled."""
     before = solve_near(given, lights, series=(first,))
     solved, mean_z = (before.status == Status.OK).reshape(given.mask.shape), mean_height(given.camera)
     height = np.full(given.mask.shape, mean_z, np.float32) if before.height is None else whole_surface(
         before.height, solved, given.mask, mean_z=mean_z, perspective=given.camera.projection == "perspective")
-    points = np.moveaxis(given.camera.points(height), -1, 0).reshape(3, -1)
-    solution = solver(given, pad_lights(lights.direction, lights.strength, given.stack.scale),
-                      NearField(pad_places(lights.place, lights.lobe), points))
+    solution = solver(given, pad_lights(lights.direction, lights.strength, given.stack.scale), field_on(given, lights, height))
     mark_not_facing(given.camera, solution)
     solved = (solution.status == Status.OK).reshape(given.mask.shape)
     solution.integration = integrate(given, solution.normal, solved, sigma=solution.standard_error())

@@ -75,7 +75,7 @@ def test_a_lamp_that_did_not_change_is_said(relit, tmp_path):
 
 
 def test_soft_boxes_near_each_other_are_two(relit, tmp_path):
-    """Of 30°, 1.8° apart, which is a fifth of what their spots spread by, as two places of a box that is held by hand."""
+    """Two soft boxes of 30° stand 1.8° apart, as a box that is held by hand may; their spots spread by five times as much."""
     images = list(mirror_images())
     beside = DIRECTIONS[1] + [0.0, 0.033, 0.0]
     for number, way in ((1, DIRECTIONS[1]), (3, beside / np.linalg.norm(beside))):

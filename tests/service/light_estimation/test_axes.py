@@ -80,13 +80,14 @@ def test_a_round_paraboloid_mirrored_is_a_saddle_which_fits_as_well():
 
 
 def test_few_lights_ask_for_more():
-    """Noisy normals fit a mirroring better, but not well where all places count."""
+    """Noisy normals fit a mirroring better, but not well."""
     mirrored = at_sites(np.diag([1, -1, 1]) @ NORMAL)
     assert wrong_axes(mirrored, strict=True) is not None
     rng = np.random.default_rng(1)
     spoilt = mirrored + [[[0], [0], [0]]]
-    spoilt[:, :2] += 0.06 * rng.normal(size=spoilt[:, :2].shape)
-    assert wrong_axes(spoilt) is not None
+    spoilt[:, :2] += 0.1 * rng.normal(size=spoilt[:, :2].shape)
+    found = wrong_axes(spoilt)
+    assert found is not None and found.left > 0.1
     assert wrong_axes(spoilt, strict=True) is None
 
 
