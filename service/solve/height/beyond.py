@@ -18,17 +18,6 @@ MIRRORED, TURNED = 1, 2
 """Numbers of the ways in which a surface goes on beyond a border; 0: it ends there."""
 LIKELY = np.array([0.4, 0.1, 0.5])
 """Likelihood of each of these before the readings are asked. Near a border slopes are kept, and mirror images bend what is round."""
-COST_TEMPERATURE = 0.05
-"""Softmax temperature of their cost, relative to the least one: a groove that ends with the image costs .4 more with light from beyond it,
-parts that are cut from folds cost .02 to .1 less with that of the way that is next to the truth."""
-
-
-def likelihoods(costs: np.ndarray, lacking: np.ndarray) -> np.ndarray:
-    """Return the likelihood of each way, [3], by the cost of readings with its light, and by the standard errors that shadows lack of that
-    light: gloss and what is out of sight add to the light of form factors, and nothing takes from it."""
-    dearer = (costs - costs.min()) / max(COST_TEMPERATURE * float(costs.min()), 1e-12)
-    likely = LIKELY * np.exp(-dearer - (lacking**2 - lacking.min()**2) / 2)
-    return likely / likely.sum()
 
 
 class Border(NamedTuple):

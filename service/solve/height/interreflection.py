@@ -138,15 +138,17 @@ def patches_of(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp
     pixel = (-centres[:, 2] if perspective else np.ones(len(kept))) / float(np.mean(projection.scale))
     areas = count[kept] * pixel**2 / np.maximum((facing * to_viewer).sum(axis=1), LEAST_FACING)
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
-    radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept), min(PIXELS_PER_PATCH, side * side))
+    radiance = patch_radiance(given.stack, lights, pixels, patch, len(kept))
     cells = np.stack(np.divmod(kept, shape[1]), axis=1)
     return Patches(centres, facing, areas, cells, radiance, number.reshape(shape), side, on_device)
 
 
-def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int, each: int) -> np.ndarray:
-    """Return [patches, 3, lights] float32: mean radiance / irradiance of `each` pixels of each patch, evenly chosen."""
+def patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int) -> np.ndarray:
+    """Return [patches, 3, lights] float32: mean radiance / irradiance of some pixels of each patch, evenly chosen.
+    `pixels`, `patch`: [n] and the number of the patch of each."""
     order = np.argsort(patch, kind="stable")
     sizes = np.bincount(patch, minlength=patches)
+    each = min(PIXELS_PER_PATCH, int(sizes.max()))
     first = np.cumsum(sizes) - sizes
     steps = (np.arange(each)[None] + 0.5) / each * sizes[:, None]
     chosen = pixels[order[first[:, None] + steps.astype(int)]]

@@ -9,8 +9,9 @@ import warp as wp
 
 from kernels.photometric.lambertian.readings import pad_lights
 from service.requests.solve import Method, SolveRequest
-from service.solve.height.beyond import LIKELY, MIRRORED, TURNED, light_from_beyond, likelihoods
+from service.solve.height.beyond import LIKELY, MIRRORED, TURNED, light_from_beyond
 from service.solve.height.interreflection import arriving_light, patches_of
+from service.solve.methods.bounce_evidence import weighed
 from service.solve.solve import solve
 from stage.capture.camera import Camera
 from stage.pixels import Crop
@@ -74,9 +75,9 @@ def test_readings_and_shadows_tell_how_a_surface_goes_on():
     """In closed form: a way that costs a twentieth more is less likely by a factor of e, one whose light shadows lack by 3 standard errors
     more than by that of another by one of exp(4)."""
     alike = np.ones(3)
-    assert likelihoods(alike, 0 * alike) == pytest.approx(LIKELY)
-    assert likelihoods(np.array([1.05, 1.05, 1.0]), alike)[2] / LIKELY[2] == pytest.approx(np.e / (np.e * LIKELY[2] + 1 - LIKELY[2]))
-    told = likelihoods(alike, np.array([1.0, 3.0, 3.0]))
+    assert weighed(LIKELY, alike, 0 * alike) == pytest.approx(LIKELY)
+    assert weighed(LIKELY, np.array([1.05, 1.05, 1.0]), alike)[2] / LIKELY[2] == pytest.approx(np.e / (np.e * LIKELY[2] + 1 - LIKELY[2]))
+    told = weighed(LIKELY, alike, np.array([1.0, 3.0, 3.0]))
     assert told[0] / told[1] == pytest.approx(np.exp(4) * LIKELY[0] / LIKELY[1])
 
 
