@@ -32,7 +32,8 @@ LEAST_PX, LEAST_ALIKE = 0.1, 0.75
 """Least root mean square move, and correlation of the moves that both halves tell: 0.08 px and 0.6 at most of steady captures of texture,
 real and path-traced, 0.15 px and 0.8 to 0.99 of those that shake by 0.4 px."""
 LEAST_Z, SURE_DEGREES = 0.35, 8.0
-"""Least z of a normal, and largest σ, at places whose curl is compared."""
+"""Least z of a normal whose curl is compared, and largest σ of one at a place that tells: of metal edges neither normals nor albedo are
+known, which is no texture then."""
 MOST_CURL, LEAST_BEND, MOST_BEND = 0.3, 0.02, 0.6
 """Largest curl that is no edge; least second derivative of ln albedo that is texture, and the largest for which it is linear."""
 LEAST_PLACES, ROUNDS = 150, 5
@@ -77,18 +78,19 @@ def find_motion(given: SolveInput, lights: DistantLights, solution: Solution) ->
         return []
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     seen = list(squares(given, lights, solution.normal, estimated, most_lights=MOST_LIGHTS))
-    found = _shake(lights.direction[evenly(len(lights.direction), MOST_LIGHTS)], seen), _drift(lights, solution, estimated, seen)
+    found = _shake(lights.direction[evenly(len(lights.direction), MOST_LIGHTS)], solution, seen), _drift(lights, solution, estimated, seen)
     return [motion for motion in found if motion is not None]
 
 
-def _shake(directions: np.ndarray, seen: list[Square]) -> Shake | None:
+def _shake(directions: np.ndarray, solution: Solution, seen: list[Square]) -> Shake | None:
     """Return how far frames are moved against each other, root mean square; None if they seem steady. `directions`: [lights, 3]."""
     count = len(directions)
     if count < LEAST_LIGHTS:
         return None
     matrix, vector = np.zeros((2, count, 2, 2)), np.zeros((2, count, 2))
     for square in seen:
-        grey = np.where((square.albedo > 0).all(axis=-1), square.albedo.mean(axis=-1), np.nan)
+        sure = (square.albedo > 0).all(axis=-1) & (solution.sigma[square.place] < SURE_DEGREES)
+        grey = np.where(sure, square.albedo.mean(axis=-1), np.nan)
         down, right = np.gradient(np.log(grey))
         steps = np.stack([down, right], axis=-1)
         step = np.abs(steps).max(axis=-1)
