@@ -42,14 +42,20 @@ class Case(NamedTuple):
     """How far the lights that the manifest gives are off."""
     ball: bool = False
     """A ball of the same material floats before the body."""
+    ground: float = 0.0
+    """Albedo of a table that the body lies on; 0: there is none."""
 
 
+LOW = -0.95
+"""Height of the table, just below the body."""
 BALL = {"type": "sphere", "center": [0.25, 0.2, 1.6], "radius": 0.28}
 CASES = (
     Case("svbrdf, matt, 64 lights", MATT),
     Case("svbrdf, matt, a ball before the body, 64 lights", MATT, ball=True),
     Case("svbrdf, gloss, a ball before the body, 64 lights", GLOSS, ball=True),
     Case("svbrdf, metal, a ball before the body, 64 lights", GOLD, ball=True),
+    Case("svbrdf, matt, on a white table, 24 lights", MATT, lights=24, ground=0.7),
+    Case("svbrdf, gloss, on a white table, 24 lights", GLOSS, lights=24, ground=0.7),
     Case("svbrdf, gloss, 64 lights", GLOSS),
     Case("svbrdf, metal, 64 lights", GOLD),
     Case("svbrdf, metal of another lobe, 64 lights", CHROME, in_model=False),
@@ -109,16 +115,20 @@ def lump(mi: Any, bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray, *, ball: bool) -> Body:
-    """Trace the body under each light, and its normals; with a ball before it where one is asked for."""
+def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray, *, ball: bool, ground: float = 0.0) -> Body:
+    """Trace the body under each light, and its normals; with a ball before it, and on a table of that albedo, where they are asked for."""
     def sun(way: np.ndarray) -> dict[str, Any]:
         return {"type": "directional", "direction": [float(-x) for x in way], "irradiance": {"type": "rgb", "value": [np.pi] * 3}}
 
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     sensor = mi.load_dict({"type": "orthographic", "film": film, "sampler": {"type": "independent"},
                            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])})
+    things = {"body": lump(mi, bsdf), **({"ball": BALL | {"bsdf": bsdf}} if ball else {})}
+    table = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, LOW]).scale([4, 4, 1]),
+             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [ground] * 3}}}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": BOUNCES, "hide_emitters": True},
-                          "body": lump(mi, bsdf), "sun": sun(directions[0]), **({"ball": BALL | {"bsdf": bsdf}} if ball else {})})
+                          "sun": sun(directions[0]), **things, **({"table": table} if ground else {})})
+    alone = mi.load_dict({"type": "scene", **things})
     images = []
     for seed, way in enumerate(directions):
         params = mi.traverse(scene)
@@ -127,7 +137,7 @@ def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray, *, ball: bool)
         images.append(np.array(mi.render(scene, sensor=sensor, spp=PATHS, seed=seed)))
 
     def hit(row: float, col: float) -> Any:
-        return scene.ray_intersect(mi.Ray3f(mi.Point3f(col * 2 / SIDE - 1, 1 - row * 2 / SIDE, 3.0), mi.Vector3f(0, 0, -1)))
+        return alone.ray_intersect(mi.Ray3f(mi.Point3f(col * 2 / SIDE - 1, 1 - row * 2 / SIDE, 3.0), mi.Vector3f(0, 0, -1)))
 
     covered = np.array([[hit(row / 2, col / 2).is_valid() for col in range(2 * SIDE + 1)] for row in range(2 * SIDE + 1)])
     mask = np.all([covered[i : i + 2 * SIDE : 2, j : j + 2 * SIDE : 2] for i in range(3) for j in range(3)], axis=0)
@@ -186,9 +196,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
         directions = lattice(LIGHTS, WIDEST_DEGREES)
         bodies: dict[str, Body] = {}
         for case in CASES:
-            key = json.dumps([case.bsdf, case.ball])
+            key = json.dumps([case.bsdf, case.ball, case.ground])
             if key not in bodies:
-                bodies[key] = render(mi, case.bsdf, directions, ball=case.ball)
+                bodies[key] = render(mi, case.bsdf, directions, ball=case.ball, ground=case.ground)
             with tempfile.TemporaryDirectory() as folder:
                 capture = photograph(case, bodies[key], directions, Path(folder))
                 yield judge(case.name, case.in_model, capture, bodies[key].normal, bodies[key].mask)
