@@ -6,12 +6,12 @@ Names and tables are looked at first, then the images themselves (stage.importer
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 from stage.capture.manifest import FILE_NAME
-from stage.errors import ManifestError, storage
+from stage.errors import ManifestError, StageError, storage
 from stage.folders import advice, natural_order
 from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
@@ -24,6 +24,7 @@ from stage.importers.layout import image_names, read_lines
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
+from stage.importers.lp import read_lights
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.results.depth_maps import DEPTH_FILE
@@ -37,6 +38,9 @@ POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz", "
 LOOKED_FOR = ("photographs with a table, a list or a rig of lights; four or more photographs of one size; Gray codes, phase steps or "
               "stripes of a laser; arrays of a time-of-flight camera or of photon counts")
 """The layouts, in words."""
+
+MOST_HEADINGS = 2
+"""Lines of a table of lights before the first light: its count and its headings."""
 
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
 """Words in the names of files that hold planes, and of images of a stripe."""
@@ -60,7 +64,8 @@ def guess(source: Path) -> Guess:
         _correlations, _histograms, _video, partial(guess_images.photos, shown=shown))
     for look in ways:
         if (found := look(folder)) is not None:
-            return found
+            passed = tuple(_passed_over(folder)) if found.has_unknown_lights else ()
+            return found._replace(assumed=(*found.assumed, *passed), sure=found.sure and not passed)
     suffixes = Counter(Path(name).suffix.lower() for name in names)
     held = ", ".join(f"{count} {suffix or 'without suffix'}" for suffix, count in suffixes.items())
     raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows (looked for: {LOOKED_FOR}): "
@@ -102,9 +107,17 @@ def _lp(folder: Folder) -> Guess | None:
     if not files:
         return None
     path = folder.path / files[0]
-    others = () if len(files) == 1 else (f"{files[0]} is the list of the lights, and not {files[1]}",)
-    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True, sure=not others,
-                assumed=others, summary=lit(max(len(read_lines(path)) - 1, 0), "from {} directions", path))
+    assumed = [] if len(files) == 1 else [f"{files[0]} is the list of the lights, and not {files[1]}"]
+    count = 0
+    try:
+        count = len(read_lights(path)[1])
+    except StageError as error:
+        table = tried(partial(read_light_table, path))
+        if table is not None and table.names is None:
+            return None  # a table of lights in the order of the images
+        assumed.append(str(error))
+    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True,
+                sure=len(files) == 1 and count > 0, assumed=tuple(assumed), summary=lit(count, "from {} directions", path))
 
 
 def _kinect(folder: Folder) -> Guess | None:
@@ -233,6 +246,18 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
                          *([f"{len(missing)} images of {path.name} are not there, {missing[0]} the first"] if missing else ()),
                          *encoding(folder)))
     return None
+
+
+def _passed_over(folder: Folder) -> Iterator[str]:
+    """Yield why tables with a line for each image are not read as those of its lights."""
+    for path in folder.with_suffix(*TABLES):
+        if path.parent.absolute() != folder.path.absolute() or path.suffix.lower() in (".mat", ".npy", ".json"):
+            continue
+        if 0 <= len(read_lines(path)) - len(folder.pictures) <= MOST_HEADINGS:
+            try:
+                read_light_table(path)
+            except StageError as error:
+                yield f"{path.name} is no table of lights that can be read: {str(error).removeprefix(f'{path}: ')}"
 
 
 def _not_there(folder: Folder, names: Sequence[str]) -> list[str]:

@@ -69,10 +69,12 @@ def image_named(given: str, names: Sequence[str]) -> str | None:
 
 
 def read_text(path: Path) -> str:
-    """Return the content of a text file in UTF-8, in UTF-16 with its mark, or in the code page of Western Windows."""
+    """Return the content of a text file in UTF-8, in UTF-16 with its mark or without, or in the code page of Western Windows."""
     data = inputs.read_bytes(path)
+    marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    two_bytes = next((name for at, name in ((1, "utf-16-le"), (0, "utf-16-be")) if data[at:4:2] == b"\0\0"), None)
     try:
-        return data.decode("utf-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig")
+        return data.decode("utf-16" if marked else two_bytes or "utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("cp1252", "replace")
 

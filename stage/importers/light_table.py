@@ -31,6 +31,8 @@ FLAT = 0.2
 """The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles."""
 HALF_TURN = 180.0
 """Degrees above which a column without negative numbers is an azimuth, however long the radius beside it."""
+ROUND, QUARTER = 2 * np.pi, np.pi / 2 + 0.01
+"""Most that azimuths and elevations in radians are, the second rounded up; azimuths of a dome span three quarters of a turn or more."""
 WHOLE, FRACTION = re.compile(r"-?\d+"), re.compile(r"0\d+")
 """A whole number, and what stands behind a decimal comma as no whole number does."""
 
@@ -118,26 +120,31 @@ def _numbers(values: np.ndarray, run: Run | None, what: str) -> LightTable:
 
 def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
     """Refuse a light without a direction, which `place` names, and angles."""
-    check_angles(table.vectors, table.what)
+    _check_angles(table.vectors, table.what)
     for index, vector in enumerate(table.vectors):
         if not np.isfinite(vector).all() or not vector.any():
             raise ManifestError(f"{place(index)}: {' '.join(f'{value:g}' for value in vector)} is no direction and no position")
-    for name in table.names or ():
+    for index, name in enumerate(table.names or ()):
         if (fault := name_fault(name)) is not None:
-            raise ManifestError(f"{table.what}: the image name {ascii(name)[1:-1][:60]} {fault}")
+            raise ManifestError(f"{place(index)}: the image name {ascii(name)[1:-1][:60]} {fault}")
     if table.names is not None and len(set(table.names)) < len(table.names):
-        twice = next(name for index, name in enumerate(table.names) if name in table.names[:index])
-        raise ManifestError(f"{table.what}: names {twice} twice")
+        twice = next(index for index, name in enumerate(table.names) if name in table.names[:index])
+        raise ManifestError(f"{place(twice)}: names {table.names[twice]} a second time: each light has an image of its own")
     return table
 
 
 def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
     """Return the headings of a text file in small letters, the number and the parts of each line, and the count in its first line."""
     lines = [(number, line) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
-    separator = next((mark for mark in (";", "\t", ",") if any(mark in line for _, line in lines)), None)
+    separator = _separator([line for _, line in lines])
+    fewest = min((numbers for _, line in lines if (numbers := _numbers_at_end(line)) > 2), default=0)
 
     def split(line: str) -> list[str]:
-        parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True)) if separator else line.split()
+        if separator is not None:
+            parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        else:  # a name before the numbers may hold spaces
+            numbers = min(_numbers_at_end(line), fewest)
+            parts = line.rsplit(maxsplit=numbers) if numbers else line.split()
         return [with_point(part.strip().strip('"').strip("'")) for part in parts]
 
     rows = [(number, split(line)) for number, line in lines]
@@ -154,6 +161,21 @@ def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], in
             raise ManifestError(f"{path}: line {number}: has {len(parts)} cells" + (f" under {len(headings)} headings" if headings else "")
                                 + ": part columns by semicolons where numbers have decimal commas")
     return headings, rows, count
+
+
+def _separator(lines: list[str]) -> str | None:
+    """Return what parts the columns of most lines; None: white space."""
+    for mark in ";\t":
+        if 2 * sum(line.count(mark) > 1 for line in lines) >= len(lines) > 0:
+            return mark
+    decimal = sum(_numbers_at_end(line) in (len(line.split()), *range(3, 8)) for line in lines)  # commas are then within numbers
+    return None if 2 * decimal > len(lines) or not any("," in line for line in lines) else ","
+
+
+def _numbers_at_end(line: str) -> int:
+    """Return how many numbers a line ends with, between white space."""
+    words = line.split()
+    return next((count for count, word in enumerate(reversed(words)) if _number(with_point(word)) is None), len(words))
 
 
 def _number(text: str) -> float | None:
@@ -214,13 +236,17 @@ def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[in
     return rows
 
 
-def check_angles(vectors: np.ndarray, what: str) -> None:
-    """Refuse two angles beside a radius, as vectors [lights, 3]. `what`: the file, for the message."""
-    for radius, angles in ((0, (1, 2)), (2, (0, 1))):
+def _check_angles(vectors: np.ndarray, what: str) -> None:
+    """Refuse two angles, in degrees or radians, beside a radius, as vectors [lights, 3]. `what`: the file, for the message."""
+    for radius, angles in ((0, (1, 2)), (0, (2, 1)), (2, (0, 1)), (2, (1, 0))):
         length, given = vectors[:, radius], vectors[:, angles]
         turn, height = np.abs(given).T
-        if (len(length) > 3 and np.ptp(length) == 0 and 90 < turn.max() <= 360 and height.max() <= 90
-                and (length[0] < FLAT * float(np.median(np.hypot(turn, height))) or (given.min() >= 0 and turn.max() > HALF_TURN))):
+        if len(length) < 4 or np.ptp(length) > 0 or np.ptp(height) == 0:
+            continue
+        degrees = 90 < turn.max() <= 360 and height.max() <= 90 and (
+            length[0] < FLAT * float(np.median(np.hypot(turn, height))) or (given.min() >= 0 and turn.max() > HALF_TURN))
+        radians = np.ptp(given[:, 0]) > 0.75 * ROUND and turn.max() <= ROUND and given[:, 1].min() >= 0 and height.max() <= QUARTER
+        if degrees or radians:
             raise ManifestError(f"{what}: its columns look like two angles and a radius of {length[0]:g}: there must be x, y and z "
                                 "of each light")
 

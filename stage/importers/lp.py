@@ -1,12 +1,12 @@
-"""Import of RTI `.lp` files: a count, then one line for each image with its name and the direction x y z of its light.
+"""Import of RTI `.lp` files: a count, then one line for each image with its name and the direction x y z of its light. Other tables of
+lights with names of images under that ending are read as well (stage.importers.light_table).
 
 The convention is that of RTIBuilder and its viewers: x right, y up, z towards the camera; the vector points to the light. The file
-does not give the colour space: 8-bit images are taken as sRGB and others as scene-linear, and the manifest declares it. Nor does it give
-the strength of the lights, which are declared equal, with an unknown common scale.
+does not give the colour space: 8-bit images are taken as sRGB and others as scene-linear, and the manifest declares it. Nor does it mostly
+give the strength of the lights, which are then declared equal, with an unknown common scale.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,11 +22,9 @@ from stage.importers.layout import (
     image_names,
     image_resolution,
     light_scale,
-    read_lines,
     write_capture,
 )
-from stage.importers.light_table import check_angles
-from stage.model import name_fault
+from stage.importers.light_table import LightTable, read_light_table
 
 NO_UNIT = 2.0
 """Median length of the vectors of a file from which on they are no directions: those are one long, or a little off that by rounding."""
@@ -39,43 +37,45 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     the reading of a white surface that faces a light; None: unknown."""
     path = _find(source)
     folder = path.parent
-    lines = read_lines(path)
-    if not lines or not lines[0][1].isdecimal():
-        raise ManifestError(f"{path}: line {lines[0][0] if lines else 1}: must be the count of images")
-    count, rows = int(lines[0][1]), lines[1:]
-    if count != len(rows):
-        raise ManifestError(f"{path}: says {count} images, holds {len(rows)}")
     scale, irradiance = light_scale(white)
-    beside = image_names(folder)
-    frames = [_frame(path, folder, beside, number, row, irradiance) for number, row in rows]
-    if not frames:
-        raise ManifestError(f"{path}: names no image")
-    named: dict[str, int] = {}
-    for (number, _), frame in zip(rows, frames, strict=True):
-        before = named.setdefault(frame["image"], number)
-        if before != number:
-            raise ManifestError(f"{path}: line {number}: names {frame['image']}, which line {before} names already: each light has an "
-                                "image of its own")
-    first = folder / frames[0]["image"]
+    table, names = read_lights(path)
+    strengths = irradiance * (np.ones((len(names), 3)) if table.strengths is None else table.strengths)
+    first = folder / names[0]
     resolution = image_resolution(first)
-    check_angles(np.array([frame["light"]["direction"] for frame in frames]), str(path))
     space = color_space or color_space_of(first)
     return write_capture({
         "name": path.stem,
         "color_space": space,
-        "assumed": [*assumed_encoding(space, color_space), *_lengths(path, frames), *doubled_lights(
-            [f"line {number} ({frame['image']})" for (number, _), frame in zip(rows, frames, strict=True)],
-            [frame["light"]["direction"] for frame in frames], path)],
+        "assumed": [*assumed_encoding(space, color_space), *_lengths(path, table.vectors),
+                    *doubled_lights(names, table.vectors.tolist(), path)],
         "camera": (view or View()).entry(resolution),
-        "mask": mask_beside(folder, list(named)),
+        "mask": mask_beside(folder, names),
         "irradiance_scale": scale,
-        "frames": frames,
+        "frames": [{"image": name, "light": {"type": "distant", "direction": direction, "irradiance": strength}}
+                   for name, direction, strength in zip(names, table.vectors.tolist(), strengths.tolist(), strict=True)],
     }, path, destination)
 
 
-def _lengths(path: Path, frames: list[dict[str, Any]]) -> list[str]:
+def read_lights(path: Path) -> tuple[LightTable, list[str]]:
+    """Return the lights of an .lp file, and the image of each in its folder."""
+    table = read_light_table(path, run="rows")
+    if table.names is None:
+        raise ManifestError(f"{path}: names no images: relit import olat takes lights in the order of the images")
+    beside = image_names(path.parent)
+    names = [_image(path.parent, beside, name) for name in table.names]
+    first: dict[str, str] = {}
+    for given, name in zip(table.names, names, strict=True):
+        if (before := first.setdefault(name, given)) != given:
+            raise ManifestError(f"{path}: {before} and {given} are both {name}: each light has an image of its own")
+    if missing := [name for name in names if not inputs.is_file(path.parent / name)]:
+        more = f", and {len(missing) - 1} more are not" if len(missing) > 1 else ""
+        raise ManifestError(f"{path}: its image {missing[0]} is not in the folder{more}: find the images, or take their lines out")
+    return table, names
+
+
+def _lengths(path: Path, vectors: np.ndarray) -> list[str]:
     """Return the sentence for vectors that are as long as positions are."""
-    lengths = np.linalg.norm([frame["light"]["direction"] for frame in frames], axis=1)
+    lengths = np.linalg.norm(vectors, axis=1)
     if np.median(lengths) < NO_UNIT:
         return []
     return [f"frames[].light.direction: the vectors of {path.name} are {lengths.min():.3g} to {lengths.max():.3g} long, as positions are, "
@@ -92,21 +92,11 @@ def _find(source: Path) -> Path:
     return found[0]
 
 
-def _frame(path: Path, folder: Path, beside: list[str], number: int, row: str, irradiance: float) -> dict[str, Any]:
-    parts = row.rsplit(maxsplit=3)  # a name may hold spaces
-    try:
-        direction = [float(part) for part in parts[1:]]
-    except ValueError:
-        direction = []
-    if len(direction) != 3 or not np.isfinite(direction).all():
-        raise ManifestError(f"{path}: line {number}: {row[:60]!r} is not an image name and three numbers")
-    if not any(direction):
-        raise ManifestError(f"{path}: line {number}: the light direction has zero length")
-    if (fault := name_fault(parts[0])) is not None:
-        raise ManifestError(f"{path}: line {number}: the image name {fault}")
-    # names often hold folders of the machine that made the file, while the images lie beside the file, converted since
-    name = parts[0].strip('"').replace("\\", "/")
+def _image(folder: Path, beside: list[str], given: str) -> str:
+    """Return the image that a name means: they often hold folders of the machine that made the file, while the images lie beside the file,
+    converted since."""
+    name = given.replace("\\", "/")
     with storage("read", folder / name):  # a name that is too long is an error of the file system
-        relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else (
-            image_named(name, beside) or name.rsplit("/", 1)[-1])
-    return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [irradiance] * 3}}
+        if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name):
+            return name
+    return image_named(name, beside) or name.rsplit("/", 1)[-1]

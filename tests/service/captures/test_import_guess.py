@@ -284,6 +284,15 @@ def test_a_table_of_other_images_is_none(relit, tmp_path):
     relit("import", "guess", tmp_path).refused("which is no layout that relit import knows")
 
 
+def test_a_table_that_cannot_be_read_is_not_passed_over_in_silence(relit, tmp_path):
+    for number, image in enumerate(make_scene(12, 9).images):
+        write_image(tmp_path / f"{number}.png", np.round(image / image.max() * 60000).astype(np.uint16))
+    assert "sure     yes" in relit("import", "guess", tmp_path).well()
+    (tmp_path / "angles.csv").write_text("azimuth,elevation\n" + "".join(f"{40 * k},{50 + k}\n" for k in range(9)))
+    said = relit("import", "guess", tmp_path).well()
+    assert "angles.csv is no table of lights that can be read" in said and "sure     yes" not in said
+
+
 def test_results_need_no_import(relit, tmp_path):
     for name in ("maps.exr", "report.json"):
         (tmp_path / name).touch()

@@ -78,8 +78,9 @@ def test_names_with_umlauts_as_windows_and_macos_write_them(folder, encoding, na
 
 
 def test_a_plane_of_lamps_at_one_height_is_no_table_of_angles(folder):
-    (folder / "lights.csv").write_text("x,y,z\n-200,-80,350\n200,-80,350\n-200,80,350\n200,80,350\n")
-    assert len(lights_of(folder, None)[0]) == 4
+    for side in (200, 2):
+        (folder / "lights.csv").write_text(f"x,y,z\n-{side},-1,1.75\n{side},-1,1.75\n-{side},1,1.75\n{side},1,1.75\n")
+        assert len(lights_of(folder, None)[0]) == 4
 
 
 def test_lights_in_columns(folder):
@@ -168,11 +169,12 @@ def test_what_was_understood_is_told(folder):
     ("image,x,y,z\na.jpg,1,2\n", {}, r"line 2: 'a\.jpg 1 2' lacks a value"),
     (rows(X[:2], Y[:2], Z[:2]), {}, r"2 lights, the folder 4 images \(IMG_2\.JPG to IMG_11\.JPG\)"),
     ("image,x,y,z\nno.jpg,0,0,1\n", {}, r"dirs\.txt: names no\.jpg, which is no image in the folder"),
-    ("image,x,y,z\nIMG_2.JPG,0,0,1\nIMG_2.JPG,0,1,1\n", {}, r"names IMG_2\.JPG twice"),
+    ("image,x,y,z\nIMG_2.JPG,0,0,1\nIMG_2.JPG,0,1,1\n", {}, r"line 3: names IMG_2\.JPG a second time"),
     ("id,x,y,z\n" + rows(["4", "2", "3", "1"], X, Y, Z, separator=","), {}, r"numbers its lights 4, 2, 3, 1"),
     (rows(["4", "2", "3", "1"], X, Y, Z), {}, r"numbers its lights 4, 2, 3, 1"),
     ("-120 40 1\n30 60 1\n95 12 1\n170 80 1\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
     ("120 40 350\n30 60 350\n195 12 350\n270 80 350\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 350"),
+    ("0.7 -1.2 1\n1.1 0.4 1\n0.2 2.9 1\n0.6 -3 1\n", {"run": "rows"}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
     ("".join(f"{name},0,05,0,5,0,8\n" for name in NAMES), {}, "line 1: has 7 cells: part columns by semicolons where numbers"),
     ("image,x,y,z\nIMG_2.JPG,0,5,0,3,0,8\n", {}, "line 2: has 7 cells under 4 headings: part columns by semicolons"),
     (rows(["1", "2", "4", "5"], X, Y, Z), {}, "its first column numbers the lights 1, 2, 4, 5 … with gaps"),
