@@ -27,8 +27,9 @@ from service.requests.imports.patterns import (
 )
 from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
-from stage.capture.manifest import other_sizes, read_manifest, write_manifest
-from stage.errors import ManifestError
+from stage.capture.capture import Capture
+from stage.capture.manifest import read_manifest, write_manifest
+from stage.errors import ManifestError, StageError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
 from stage.importers.video import is_video
@@ -48,8 +49,12 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
     if more:
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
-    said = (*manifest.assumed, *other_sizes(manifest))
-    return imported._replace(facts=(*imported.facts, *(("assumed", sentence) for sentence in said)))
+    try:
+        said = tuple(("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in Capture.open(imported.path).doubts
+                     if doubt not in more)
+    except StageError as error:  # of an image, which the import need not have looked at
+        said = (*(("assumed", sentence) for sentence in manifest.assumed), ("fault", str(error)))
+    return imported._replace(facts=(*imported.facts, *said))
 
 
 def _diligent(request: DiligentImport) -> Imported:

@@ -1,6 +1,7 @@
 """Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, PPM, raw), the header first, then pixels; writing of PNG."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -25,6 +26,16 @@ CODES = {oiio.UINT8, oiio.UINT16}
 """Integers that `read_recorded` leaves as they are: tables of what each stands for are short."""
 
 
+PROFILES = {
+    "linear.*(srgb|709)|(srgb|709).*(linear|g10)": "lin_rec709_scene", r"linear|gamma 1\.0|[_ ]g10": "",
+    "prophoto|romm|wide gamut|eci ?rgb|apple rgb|colormatch|dot gain": "other", "adobe ?rgb": "g22_adobergb_scene",
+    "display p3": "srgb_p3d65_scene", "srgb|s-?gr[ae]y": "srgb_rec709_scene", r"gamma 2\.2": "g22_rec709_scene",
+    r"gamma 1\.8": "g18_rec709_scene",
+}
+"""Words in the descriptions of the ICC profiles that cameras and photo programs embed, and their colour spaces; the first that fit count.
+Of linear ones many have primaries that the description does not say."""
+
+
 class ImageHeader(NamedTuple):
     """The size and the channels of an image, which are known before any pixel is decoded."""
 
@@ -37,8 +48,8 @@ class ImageHeader(NamedTuple):
     exposure: Exposure = Exposure()  # as EXIF says
     half: bool = False  # whether all colour channels hold half values
     multiplied: float = 1.0  # the factor that a Radiance file says its values were multiplied by
-    encoding: str = ""  # what a Radiance file says of values that are not linear ones of Rec.709
-    space: str = ""  # the colour space that an EXR file declares; empty where it declares none
+    encoding: str = ""  # what a Radiance header or a profile says of values that are not linear ones of Rec.709
+    space: str = ""  # the colour space that an EXR file declares, or that of an ICC profile; empty where it declares none
     pixel_aspect: float = 1.0  # the width of a pixel over its height, as an EXR file declares
     eight_bits: bool = False  # whether the file holds integers of eight bits
 
@@ -100,15 +111,17 @@ def header_of(source: inputs.Source) -> ImageHeader:
         source.check_pixels(*integrity.jxl_resolution_of(path, source.file))
     elif suffix == ".avif":
         found = avif.header_of(path, source.file)
-        return ImageHeader(found.width, found.height, found.channels, found.channels + 1, True)
+        return ImageHeader(found.width, found.height, found.channels, found.channels + 1, True, eight_bits=found.bits == 8)
     elif suffix in camera_raw.SUFFIXES:
         raw = camera_raw.header_of(source)
         return ImageHeader(raw.width, raw.height, 3, 3, True, raw.orientation, raw.exposure)
     with _decoder(source) as decoder:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
+        space, encoding = _profile(str(spec.getattribute("ICCProfile:profile_description") or ""))
         stated = ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                              spec.format.basetype not in FLOATING, orientation, _exposure(spec), eight_bits=spec.format == oiio.UINT8)
+                              spec.format.basetype not in FLOATING, orientation, _exposure(spec), eight_bits=spec.format == oiio.UINT8,
+                              space=space, encoding=encoding)
     if suffix == ".hdr":
         return stated._replace(multiplied=radiance_multiplier(source.file), encoding=radiance_encoding(source.file))
     return stated
@@ -282,6 +295,12 @@ def _orientation(path: Path, spec: oiio.ImageSpec) -> int:
     return found if found in TURNS else UPRIGHT
 
 
+def _profile(description: str) -> tuple[str, str]:
+    """Return the colour space of an ICC profile, by its description, and what to say of one whose values are encoded otherwise."""
+    space = next((space for words, space in PROFILES.items() if re.search(words, description, re.IGNORECASE)), "")
+    return ("", f"ICC profile {description}") if space == "other" else (space, "")
+
+
 def _exposure(spec: oiio.ImageSpec) -> Exposure:
     names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity")
     return Exposure(*(sound(float(spec.get_float_attribute(name, 0.0))) for name in names))
@@ -294,8 +313,10 @@ def _check_suffix(path: str | Path) -> None:
 
 
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:
-    if {"R", "G", "B"} <= set(names):
-        return ("R", "G", "B")
+    layers = {name[:-1] for name in names if {f"{name[:-1]}{letter}" for letter in "RGB"} <= set(names)}
+    if len(layers) == 1 or "" in layers:  # the only layer, or the one without a name
+        layer = "" if "" in layers else layers.pop()
+        return (f"{layer}R", f"{layer}G", f"{layer}B")
     if {"X", "Y", "Z"} <= set(names) or "RY" in names or "BY" in names:
         raise ImageError(f"{path}: has channels {', '.join(names)}, of which Y alone is grey: convert its colours to R, G, B")
     if "Y" in names:
@@ -303,7 +324,7 @@ def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...
     flat = [name for name in names if name != "A"]
     if len(flat) == 1:
         return (flat[0],)
-    raise ImageError(f"{path}: has channels {', '.join(names)}: an image needs R, G, B or one grey channel")
+    raise ImageError(f"{path}: has channels {', '.join(names)}: an image needs R, G, B, in one layer, or one grey channel")
 
 
 def _reason(text: str) -> str:

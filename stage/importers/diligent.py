@@ -8,8 +8,9 @@ scale is unknown.
 from pathlib import Path
 
 from stage.errors import ManifestError
+from stage.formats import images
 from stage.importers.camera_options import mask_beside
-from stage.importers.layout import color_space_of, doubled_lights, image_resolution, read_lines, read_table, write_capture
+from stage.importers.layout import doubled_lights, image_resolution, read_lines, read_table, write_capture
 
 
 def import_folder(source: Path, destination: Path) -> Path:
@@ -26,7 +27,7 @@ def import_folder(source: Path, destination: Path) -> Path:
     if zero:
         raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
     resolution = image_resolution(source / names[0])
-    linear = [] if color_space_of(source / names[0]) == "lin_rec709_scene" else [
+    linear = [] if not images.read_header(source / names[0]).eight_bits else [
         f"color_space: {names[0]} has 8 bits and was taken as linear, as the 16 bits of the benchmark are: JPEG images and most "
         "others of 8 bits are srgb_texture"]
     return write_capture({

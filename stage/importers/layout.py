@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import OpenImageIO as oiio
 from pydantic import ValidationError
 
 from stage import inputs
 from stage.capture.manifest import FILE_NAME, SCHEMA, Manifest, manifest_text, write_manifest
-from stage.colour.colour_spaces import ColorSpaceName
+from stage.colour.colour_spaces import NAMES, ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
 from stage.folders import natural_order
 from stage.formats import images
-from stage.formats.camera_raw import path_is_raw
 from stage.records import describe
 
 T = TypeVar("T")
@@ -118,15 +116,10 @@ def image_resolution(path: Path) -> tuple[int, int]:
 
 
 def color_space_of(path: Path) -> ColorSpaceName:
-    """Return sRGB for an image of 8-bit integers, and scene-linear for any other."""
-    if path.suffix.lower() == ".exr" or path_is_raw(path):
-        return "lin_rec709_scene"
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise ManifestError(f"{path}: cannot be read as an image")
-    eight_bit = source.spec().format == oiio.UINT8
-    source.close()
-    return "srgb_texture" if eight_bit else "lin_rec709_scene"
+    """Return the colour space that an image declares, else sRGB (`srgb_texture`) for 8-bit integers, and scene-linear for any other."""
+    header = images.read_header(path)
+    declared = header.space if header.space in NAMES else ""
+    return declared or ("srgb_texture" if header.eight_bits else "lin_rec709_scene")
 
 
 def assumed_encoding(space: ColorSpaceName, told: ColorSpaceName | None = None) -> list[str]:

@@ -172,3 +172,12 @@ def test_normals_that_three_lights_do_not_face():
     dark = ((normals @ ring(80, 3).T > 0).sum(axis=1) < 3).mean()
     assert found.dark == pytest.approx(dark, abs=0.01)  # the standard error of the random normals is 0.002
     assert f"{100 * found.dark:.0f} % of the directions" in found.sentence()
+
+
+def test_what_files_say_beside_the_manifest_is_told_at_once(relit, tmp_path):
+    """Without a solve, or relit info."""
+    for number, image in enumerate(make_scene(8, 4).images):
+        write_exr(tmp_path / f"{number}.exr", image, **({"colorInteropID": "lin_ap1_scene"} if number else {}))
+    assert "finding  color_space: lin_rec709_scene is declared, and lin_ap1_scene by 3" in relit("import", "photos", tmp_path).well()
+    write_exr(tmp_path / "4.exr", np.zeros((4, 4, 3)))
+    assert "4.exr: is 4x4, camera.resolution says 8x8" in relit("import", "photos", tmp_path).well()

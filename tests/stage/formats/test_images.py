@@ -13,6 +13,7 @@ from stage.errors import ImageError, StorageError
 from stage.formats import avif
 from stage.formats.images import check_resolution, fractions, read_header, read_mask, read_pixels, read_recorded
 from stage.formats.integrity import check_jpeg
+from stage.importers.layout import color_space_of
 from tests.scenes.captures import write_exr, write_image
 
 RNG = np.random.default_rng(7)
@@ -116,10 +117,46 @@ def test_alpha_is_dropped_and_not_multiplied(tmp_path):
     assert read_header(path)[:5] == (7, 5, 3, 4, False)
 
 
+def test_the_only_layer_of_an_exr_is_read(tmp_path):
+    """As programs write their render passes."""
+    def write(name, *layers):
+        planes = {f"{layer}.{letter}": UNIT[..., index].astype(np.float32) for layer in layers for index, letter in enumerate("RGB")}
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {**planes, "Depth.Z": UNIT[..., 0].astype(np.float32)}).write(str(tmp_path / name))
+        return tmp_path / name
+
+    assert np.array_equal(read_pixels(write("one.exr", "View.Combined")), UNIT.astype(np.float32))
+    with pytest.raises(ImageError, match="an image needs R, G, B, in one layer"):
+        read_pixels(write("two.exr", "Diffuse", "Gloss"))
+
+
+def profile(description):
+    """An ICC profile of which nothing but its description is set."""
+    text = description.encode() + b"\0"
+    tag = (b"desc" + bytes(4) + struct.pack(">I", len(text)) + text).ljust(112, b"\0")
+    head = struct.pack(">I4sI12s", 144 + len(tag), b"lcms", 0x02100000, b"mntrRGB XYZ ") + bytes(12) + b"acsp" + bytes(88)
+    return head + struct.pack(">I4sII", 1, b"desc", 144, len(tag)) + tag
+
+
+@pytest.mark.parametrize(("description", "space"), [
+    ("sRGB IEC61966-2.1", "srgb_rec709_scene"), ("Adobe RGB (1998)", "g22_adobergb_scene"), ("Display P3", "srgb_p3d65_scene"),
+    ("Gray Gamma 2.2", "g22_rec709_scene"), ("sRGB Linear", "lin_rec709_scene"), ("RTv4_Large_g10", ""), ("ProPhoto RGB", ""),
+    ("Canon EOS 5D", "")])
+def test_an_icc_profile_tells_the_colour_space(tmp_path, description, space):
+    """16-bit images of photo programs are encoded."""
+    path = tmp_path / "a.tif"
+    spec, content = oiio.ImageSpec(7, 5, 3, "uint16"), profile(description)
+    spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(content)}]"), np.frombuffer(content, np.uint8))
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.zeros((5, 7, 3), np.uint16)) and output.close()
+    header = read_header(path)
+    assert header.space == space and ("ProPhoto RGB" in header.encoding) == ("ProPhoto" in description)
+    assert color_space_of(path) == (space or "lin_rec709_scene")
+
+
 def test_channels_that_are_no_colour_are_named(tmp_path):
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"u": np.zeros((2, 2), np.float32), "v": np.zeros((2, 2), np.float32)}).write(
         str(tmp_path / "a.exr"))
-    with pytest.raises(ImageError, match="has channels u, v: an image needs R, G, B or one grey"):
+    with pytest.raises(ImageError, match="has channels u, v: an image needs R, G, B, in one layer"):
         read_header(tmp_path / "a.exr")
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"id": np.zeros((2, 2), np.uint32)}).write(str(tmp_path / "b.exr"))
     with pytest.raises(ImageError, match="integer identifiers"):
