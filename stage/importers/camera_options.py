@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stage.errors import ManifestError
-from stage.formats.camera_raw import path_is_raw
 from stage.importers.layout import image_names
 from stage.importers.light_rig import read_camera_matrix
 from stage.model import name_fault
@@ -116,13 +115,14 @@ def mask_beside(folder: Path, frames: Sequence[str]) -> str | None:
 
 
 def refuse_twins(folder: Path, names: Sequence[str]) -> None:
-    """Refuse images that are one photograph, as cameras write it twice: camera raw and JPEG under one name."""
-    raws = {Path(name).stem.lower(): name for name in names if path_is_raw(name)}
-    twin = next((name for name in names if not path_is_raw(name) and Path(name).stem.lower() in raws), None)
-    if twin is not None:
-        raw = raws[Path(twin).stem.lower()]
-        raise ManifestError(f"{folder}: {raw} and {twin} are one photograph: choose which are used, --images '*{Path(raw).suffix}' "
-                            f"or --images '*{Path(twin).suffix}'")
+    """Refuse images that are one photograph, as cameras and programs write it twice: camera raw and JPEG, or TIFF and JPEG under one
+    name."""
+    first: dict[str, str] = {}
+    for name in names:
+        before = first.setdefault(Path(name).stem.lower(), name)
+        if Path(before).suffix.lower() != Path(name).suffix.lower():
+            raise ManifestError(f"{folder}: {before} and {name} are one photograph: choose which are used, "
+                                f"--images '*{Path(before).suffix}' or --images '*{Path(name).suffix}'")
 
 
 def words_of(name: str) -> frozenset[str]:

@@ -67,8 +67,8 @@ class Pictures:
         """Read the headers; pixels are read when they are asked for."""
         sizes = {name: tried(partial(image_resolution, folder / name)) for name in names}
         known = [size for size in sizes.values() if size is not None]
-        self.size = max(set(known), key=known.count) if known else None
-        """Width and height of most images."""
+        self.size = max(set(known), key=lambda size: (known.count(size), size)) if known else None
+        """Width and height of most images; of as many small ones, as previews are, and large ones those of the latter."""
         self.names = tuple(name for name in names if self.size is not None and sizes[name] == self.size)
         self.others = tuple(name for name in names if name not in self.names)
         """Images of another size, or that cannot be read."""

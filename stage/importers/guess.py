@@ -55,11 +55,14 @@ def guess(source: Path) -> Guess:
     if REPORT in names and (held := advice(source, "")):
         raise ManifestError(f"{source}: is a result of relit, which needs no import: {held}")
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
+    for named in (_diligent, _relightlab, _lp):  # files that name their images
+        if (found := named(Folder(source, names, pictures))) is not None:
+            return found
     refuse_twins(source, pictures)
     shown = Pictures(source, pictures)
     folder = Folder(source, names, shown.names)
     ways: tuple[Callable[[Folder], Guess | None], ...] = (
-        _diligent, _relightlab, _lp, _kinect, _scans, _laser, _near_lights, partial(_table, shown=shown),
+        _kinect, _scans, _laser, _near_lights, partial(_table, shown=shown),
         partial(guess_images.scanner, shown=shown), partial(guess_images.gray, shown=shown), partial(guess_images.phase, shown=shown),
         _correlations, _histograms, _video, partial(guess_images.photos, shown=shown))
     for look in ways:
@@ -104,20 +107,25 @@ def _relightlab(folder: Folder) -> Guess | None:
 
 def _lp(folder: Folder) -> Guess | None:
     files = [name for name in folder.names if name.lower().endswith(".lp")]
-    if not files:
+    below = [path for path in folder.path.glob("*/*") if path.suffix.lower() == ".lp"]
+    if not files and (len(below) != 1 or folder.pictures):
         return None
-    path = folder.path / files[0]
-    assumed = [] if len(files) == 1 else [f"{files[0]} is the list of the lights, and not {files[1]}"]
+    path = folder.path / files[0] if files else below[0]
+    assumed = [f"{files[0]} is the list of the lights, and not {files[1]}"] if len(files) > 1 else []
     count = 0
     try:
-        count = len(read_lights(path)[1])
+        found = read_lights(path)
+        if not files and found.folder == path.parent:
+            return None  # that folder is the capture
+        count = len(found.images)
     except StageError as error:
         table = tried(partial(read_light_table, path))
         if table is not None and table.names is None:
             return None  # a table of lights in the order of the images
         assumed.append(str(error))
-    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True,
-                sure=len(files) == 1 and count > 0, assumed=tuple(assumed), summary=lit(count, "from {} directions", path))
+    return made("images of RTI with a light list", f"it has {path.relative_to(folder.path)}", ["lp", path if files else folder.path],
+                folder.path, solve=True, sure=len(files) < 2 and count > 0, assumed=tuple(assumed),
+                summary=lit(count, "from {} directions", path))
 
 
 def _kinect(folder: Folder) -> Guess | None:
@@ -249,15 +257,19 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
 
 
 def _passed_over(folder: Folder) -> Iterator[str]:
-    """Yield why tables with a line for each image are not read as those of its lights."""
+    """Yield why tables of lights, or ones with a line for each image, are not those of the images."""
+    count = len(folder.pictures)
     for path in folder.with_suffix(*TABLES):
         if path.parent.absolute() != folder.path.absolute() or path.suffix.lower() in (".mat", ".npy", ".json"):
             continue
-        if 0 <= len(read_lines(path)) - len(folder.pictures) <= MOST_HEADINGS:
-            try:
-                read_light_table(path)
-            except StageError as error:
+        try:
+            table = read_light_table(path)
+        except StageError as error:
+            if 0 <= len(read_lines(path)) - count <= MOST_HEADINGS:
                 yield f"{path.name} is no table of lights that can be read: {str(error).removeprefix(f'{path}: ')}"
+        else:
+            if table.names is None and len(table.vectors) > 2 and len(table.vectors) != count:
+                yield f"{path.name} holds {len(table.vectors)} lights, and there are {count} images: which belong together, nothing says"
 
 
 def _not_there(folder: Folder, names: Sequence[str]) -> list[str]:

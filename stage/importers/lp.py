@@ -6,7 +6,9 @@ does not give the colour space: 8-bit images are taken as sRGB and others as sce
 give the strength of the lights, which are then declared equal, with an unknown common scale.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,10 +37,10 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
     """Write a capture.json for an RTI capture.
     `source`: the .lp file, or a folder with exactly one .lp file. `color_space`: that of the images; None: by their depth. `white`:
     the reading of a white surface that faces a light; None: unknown."""
-    path = _find(source)
-    folder = path.parent
+    path, folder, table, names = read_lights(source)
+    if destination.resolve() in (path.parent.resolve(), path.parent.resolve().parent) and destination.resolve() != folder.resolve():
+        raise ManifestError(f"{path}: its images lie in {folder}: import that folder, or give one for the capture")
     scale, irradiance = light_scale(white)
-    table, names = read_lights(path)
     strengths = irradiance * (np.ones((len(names), 3)) if table.strengths is None else table.strengths)
     first = folder / names[0]
     resolution = image_resolution(first)
@@ -53,24 +55,38 @@ def import_folder(source: Path, destination: Path, *, view: View | None = None, 
         "irradiance_scale": scale,
         "frames": [{"image": name, "light": {"type": "distant", "direction": direction, "irradiance": strength}}
                    for name, direction, strength in zip(names, table.vectors.tolist(), strengths.tolist(), strict=True)],
-    }, path, destination)
+    }, path, destination, folder=folder)
 
 
-def read_lights(path: Path) -> tuple[LightTable, list[str]]:
-    """Return the lights of an .lp file, and the image of each in its folder."""
+class LightList(NamedTuple):
+    """The lights of an .lp file and their images."""
+
+    path: Path
+    folder: Path
+    """The folder of the images: that of the file, or the one that holds both, as RTIBuilder has assembly-files beside jpeg-exports."""
+    table: LightTable
+    images: list[str]
+    """The image of each light, below the folder."""
+
+
+def read_lights(source: Path) -> LightList:
+    """Return the lights of an .lp file, or of the only one in a folder or in the folders in it, with their images."""
+    path = _find(source)
     table = read_light_table(path, run="rows")
     if table.names is None:
         raise ManifestError(f"{path}: names no images: relit import olat takes lights in the order of the images")
-    beside = image_names(path.parent)
-    names = [_image(path.parent, beside, name) for name in table.names]
+    images = {folder: _images(folder, table.names) for folder in (path.parent, path.absolute().parent.parent)}
+    missing = {folder: [name for name in names if not inputs.is_file(folder / name)] for folder, names in images.items()}
+    folder = min(images, key=lambda folder: len(missing[folder]))
+    names = images[folder]
+    if lost := missing[folder]:
+        more = f", and {len(lost) - 1} more are not" if len(lost) > 1 else ""
+        raise ManifestError(f"{path}: its image {lost[0]} is not in the folder{more}: find the images, or take their lines out")
     first: dict[str, str] = {}
     for given, name in zip(table.names, names, strict=True):
         if (before := first.setdefault(name, given)) != given:
             raise ManifestError(f"{path}: {before} and {given} are both {name}: each light has an image of its own")
-    if missing := [name for name in names if not inputs.is_file(path.parent / name)]:
-        more = f", and {len(missing) - 1} more are not" if len(missing) > 1 else ""
-        raise ManifestError(f"{path}: its image {missing[0]} is not in the folder{more}: find the images, or take their lines out")
-    return table, names
+    return LightList(path, folder, table, names)
 
 
 def _lengths(path: Path, vectors: np.ndarray) -> list[str]:
@@ -86,17 +102,26 @@ def _find(source: Path) -> Path:
     if source.is_file():
         return source
     with storage("read", source):
-        found = sorted(p for p in source.iterdir() if p.suffix.lower() == ".lp")
+        found = [p for p in sorted(source.iterdir()) if p.suffix.lower() == ".lp"]
+        found = found or [p for p in sorted(source.glob("*/*")) if p.suffix.lower() == ".lp"]
     if len(found) != 1:
         raise ManifestError(f"{source}: holds {len(found)} .lp files: name the one to import")
     return found[0]
 
 
+def _images(folder: Path, given: Sequence[str]) -> list[str]:
+    """Return the image below a folder that each name means, whether it is there or not."""
+    beside = image_names(folder) if inputs.is_allowed(folder) else []
+    return [_image(folder, beside, name) for name in given]
+
+
 def _image(folder: Path, beside: list[str], given: str) -> str:
     """Return the image that a name means: they often hold folders of the machine that made the file, while the images lie beside the file,
-    converted since."""
+    converted since, or in the last of these folders."""
     name = given.replace("\\", "/")
+    near = "/".join(name.split("/")[-2:])
     with storage("read", folder / name):  # a name that is too long is an error of the file system
-        if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name):
-            return name
+        for found in (name, near):
+            if not found.startswith("/") and ":" not in found and inputs.is_file(folder / found):
+                return found
     return image_named(name, beside) or name.rsplit("/", 1)[-1]

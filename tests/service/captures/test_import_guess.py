@@ -291,6 +291,21 @@ def test_a_table_that_cannot_be_read_is_not_passed_over_in_silence(relit, tmp_pa
     (tmp_path / "angles.csv").write_text("azimuth,elevation\n" + "".join(f"{40 * k},{50 + k}\n" for k in range(9)))
     said = relit("import", "guess", tmp_path).well()
     assert "angles.csv is no table of lights that can be read" in said and "sure     yes" not in said
+    (tmp_path / "angles.csv").write_text("".join(f"{k} 1 2\n" for k in range(10)))
+    said = relit("import", "guess", tmp_path).well()
+    assert "angles.csv holds 10 lights, and there are 9 images" in said and "sure     yes" not in said
+
+
+def test_photographs_that_are_there_twice_are_named_unless_a_list_names_one_of_them(relit, tmp_path):
+    for number, image in enumerate(make_scene(12, 9).images):
+        write_image(tmp_path / f"{number}.png", np.round(image / image.max() * 60000).astype(np.uint16))
+        write_image(tmp_path / f"{number}_preview.png", np.round(image[::2, ::2] / image.max() * 60000).astype(np.uint16))
+    assert "relit import photos" in (said := relit("import", "guess", tmp_path).well()) and "--images '*.png'" in said
+    for number in range(9):
+        (tmp_path / f"{number}_preview.png").rename(tmp_path / f"{number}.TIF")
+    relit("import", "guess", tmp_path).refused("0.png and 0.TIF are one photograph: choose which")
+    (tmp_path / "a.lp").write_text("".join(f"{number}.png 0 .{number} 1\n" for number in range(9)))
+    assert "sure     yes" in relit("import", "guess", tmp_path).well()
 
 
 def test_results_need_no_import(relit, tmp_path):

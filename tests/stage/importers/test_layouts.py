@@ -218,6 +218,22 @@ def test_the_lp_file_itself_may_be_named(tmp_path):
     assert Capture.open(tmp_path / "b").name == "second"
 
 
+def test_the_folders_of_rtibuilder(tmp_path):
+    """The .lp file lies in a folder beside that of the images, and names them by their place on the machine that made it."""
+    rti(tmp_path / "coin" / "jpeg-exports", [])
+    (tmp_path / "coin" / "jpeg-exports" / "dome.lp").unlink()
+    (tmp_path / "coin" / "assembly-files").mkdir()
+    (tmp_path / "coin" / "assembly-files" / "dome.lp").write_text(
+        "\n".join([GOOD[0], *(f"D:\\RTI\\coin\\jpeg-exports\\{line}" for line in GOOD[1:])]))
+    found = guess(tmp_path / "coin")
+    assert found.sure and found.arguments == ("lp", str(tmp_path / "coin"))
+    with nothing_written(tmp_path, "its images lie in", ManifestError):
+        lp.import_folder(tmp_path / "coin" / "assembly-files" / "dome.lp", tmp_path / "coin" / "assembly-files")
+    for folder in (tmp_path / "out", tmp_path / "coin"):
+        lp.import_folder(tmp_path / "coin", folder)
+        assert Capture.open(folder).manifest.frames[0].image == "jpeg-exports/a 1.jpg"
+
+
 def test_paths_of_another_machine(tmp_path):
     (tmp_path / "sub").mkdir()
     write_image(tmp_path / "sub" / "d.jpg", np.full((4, 5, 3), 100, np.uint8))
