@@ -33,6 +33,7 @@ from stage.errors import ManifestError, StageError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
 from stage.importers.video import is_video
+from stage.stack.readings import said_by_readings
 
 if TYPE_CHECKING:
     from stage.importers.camera_options import Selection, View
@@ -45,15 +46,16 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     `assumed`: what was taken for granted by who chose the layout, which the manifest then records. Raises ManifestError if the files do not
     hold what the layout has, or do not fit the options."""
     imported = _IMPORTS[type(request)](request)
-    manifest = read_manifest(imported.path)
-    more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
+    manifest, seen = read_manifest(imported.path), []
+    try:
+        capture = Capture.open(imported.path)
+        seen = said_by_readings(capture)
+        said = [("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in (*capture.doubts, *seen)]
+    except StageError as error:  # of an image, which the import need not have looked at
+        said = [*(("assumed", sentence) for sentence in manifest.assumed), ("fault", str(error))]
+    more = tuple(sentence for sentence in (*assumed, *seen) if sentence not in manifest.assumed)
     if more:
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
-    try:
-        said = tuple(("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in Capture.open(imported.path).doubts
-                     if doubt not in more)
-    except StageError as error:  # of an image, which the import need not have looked at
-        said = (*(("assumed", sentence) for sentence in manifest.assumed), ("fault", str(error)))
     return imported._replace(facts=(*imported.facts, *said))
 
 

@@ -32,6 +32,7 @@ from stage.errors import StageError, StorageError
 from stage.formats import images
 from stage.formats.exif import TURNS, UPRIGHT
 from stage.stack.correction import Correction, saturation_limit
+from stage.stack.readings import said_by_readings
 from stage.tof.raw_frames import check_frames, read_frame
 from stage.transforms import fibonacci_sphere
 
@@ -115,6 +116,7 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         found = findings(capture, looked, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
                                            if level.picked is not None})
     looks = [*capture.doubts, *found.sentences]
+    looks += [] if faults else [said for said in said_by_readings(capture) if said not in capture.doubts]
     if request.picture is not None:
         peak = max((level.peak for level in read), default=1.0)
         facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, request.review, timings)))

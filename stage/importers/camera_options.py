@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stage.errors import ManifestError
+from stage.formats.camera_raw import path_is_raw
 from stage.importers.layout import image_names
 from stage.importers.light_rig import read_camera_matrix
 from stage.model import name_fault
@@ -115,14 +116,16 @@ def mask_beside(folder: Path, frames: Sequence[str]) -> str | None:
 
 
 def refuse_twins(folder: Path, names: Sequence[str]) -> None:
-    """Refuse images that are one photograph, as cameras and programs write it twice: camera raw and JPEG, or TIFF and JPEG under one
-    name."""
+    """Refuse images that are one photograph, as cameras and programs write it twice: camera raw and JPEG under one name, or several TIFF
+    and JPEG, of which one pair may be an image that was looked at."""
     first: dict[str, str] = {}
-    for name in names:
-        before = first.setdefault(Path(name).stem.lower(), name)
-        if Path(before).suffix.lower() != Path(name).suffix.lower():
-            raise ManifestError(f"{folder}: {before} and {name} are one photograph: choose which are used, "
-                                f"--images '*{Path(before).suffix}' or --images '*{Path(name).suffix}'")
+    twins = [(before, name) for name in names
+             if Path(before := first.setdefault(Path(name).stem.lower(), name)).suffix.lower() != Path(name).suffix.lower()]
+    twins.sort(key=lambda pair: not any(map(path_is_raw, pair)))
+    if len(twins) > 1 or any(map(path_is_raw, twins[0] if twins else ())):
+        one, other = twins[0]
+        raise ManifestError(f"{folder}: {one} and {other} are one photograph: choose which are used, --images '*{Path(one).suffix}' "
+                            f"or --images '*{Path(other).suffix}'")
 
 
 def words_of(name: str) -> frozenset[str]:

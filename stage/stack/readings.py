@@ -1,0 +1,161 @@
+"""What the readings of the frames under lights show of a capture that its manifest does not say: a level below full scale at which they are
+clipped, colours that change from frame to frame, and a mask of all but the object.
+
+Each is told by what a right capture does not show: shading has no level that many readings share and none exceeds; the colours of a pixel
+keep their ratios under all lights but for gloss, which spares most pixels; and a mask that reaches all around the image and leaves out what
+lies within is of an object where that is bright, or has a shape.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from stage.capture.capture import Capture
+from stage.capture.light import DistantLight, PointLight
+from stage.capture.manifest import Frame
+from stage.colour.colour import GREY_WEIGHTS, LARGEST_INTEGER
+from stage.stack.correction import Correction
+
+PIXELS, READ, MOST_FRAMES = 2000, 300_000, 12
+"""Pixels of the object and of the rest whose readings are compared, those of the object whose highest reading is looked for, and frames."""
+FEWEST_FRAMES = 4
+"""Frames from which on they are compared."""
+NEAR_TOP, LEVELS, SPIKE = 0.8, 16, 5.0
+"""Least part of the highest reading that is compared with it, different readings there, of shading, and how many times more pixels have the
+highest reading than any other."""
+FEWEST_CLIPPED, UNLIKE = 20, 1.1
+"""Fewest readings of all frames that are called clipped, and ratio of their numbers in two frames: a facet has one size in all."""
+EIGHT_BITS = 255
+"""The largest integer of eight bits."""
+LIT, FEWEST_LIT, MOST_LIT = 0.1, 50, 0.5
+"""Least part of the brightest readings of a frame of those whose colour is looked at, fewest of a frame, and least part of them all: a
+highlight of one side of a thing leaves the others darker than that."""
+COLOURS, MANY = 0.04, 0.3
+"""Least change of a ratio of channels that is said, which moves grey by a hundredth, and part of the frames in which it is as large."""
+PART, ALIKE, CURVED, SEVERAL = 0.8, 0.5, 0.25, 0.15
+"""Part of the pixels in which the change is alike, largest difference there, relative to it, and least residual of one normal or else least
+difference of the logarithms of ratios: the gloss of a plane of one colour changes it alike, that of what is curved or painted does not."""
+AROUND, WITHIN, LEFT_OUT = 0.9, 0.5, 0.1
+"""Least part of the pixels at the border of an image that a mask of the rest has, least part of what it leaves out that is away from the
+border, and least part of the image that it leaves out."""
+DARK, PLANE, SHAPED = 0.2, 0.1, 3.0
+"""Brightness of what the mask has over that of what it leaves out, and residual of one normal there, below which it is none of the object;
+and how many times that residual is of what it leaves out."""
+
+
+class Seen(NamedTuple):
+    """What one frame shows."""
+
+    full: int
+    """The largest integer of its file; 0 of floating-point values."""
+    top: float
+    """The highest recorded value of the object."""
+    at_top: int
+    """The number of readings that have it."""
+    crowd: int
+    """The largest number of readings that have one value near below, and how many such values there are."""
+    levels: int
+    inside: np.ndarray  # [pixels, 3] float32, radiance over the strength of the light, of some pixels of the object
+    outside: np.ndarray  # the same of what the mask leaves out
+
+
+def said_by_readings(capture: Capture, most: int = MOST_FRAMES) -> list[str]:
+    """Return a sentence for each of these that some frames of a capture under lights show; `most`: the frames that are read, evenly."""
+    lit = [(frame, frame.light) for frame in capture.manifest.frames if isinstance(frame.light, DistantLight | PointLight)]
+    if len(lit) < FEWEST_FRAMES or capture.is_polarised:
+        return []
+    mask, correction = capture.mask(), Correction.of(capture)
+    inside, outside = np.flatnonzero(mask), np.flatnonzero(~mask)
+    some = [(places, correction.at(places)) for places in (_evenly(inside, PIXELS), _evenly(outside, PIXELS))]
+    read = _evenly(inside, READ)
+
+    def see(frame: Frame, light: DistantLight | PointLight) -> Seen:
+        recorded = capture.recorded(frame.image)
+        flat, full = recorded.reshape(-1, 3), int(np.iinfo(recorded.dtype).max) if recorded.dtype.kind == "u" else 0
+        values, counts = np.unique(flat[read], return_counts=True)
+        near = counts[:-1][values[:-1] >= NEAR_TOP * values[-1]]
+        strength = light.irradiance if isinstance(light, DistantLight) else light.intensity
+        return Seen(full, float(values[-1]) / (full or 1), int(counts[-1]), int(near.max(initial=0)), len(near),
+                    *(at.corrected(flat[places][:, None], frame)[:, 0] / np.array(strength, np.float32) for places, at in some))
+
+    frames = {lit[index][0].image: see(*lit[index]) for index in _evenly(np.arange(len(lit)), most)}
+    seen = list(frames.values())
+    return [*_clipped(capture.manifest.saturation, seen), *_other_colours(frames), *_turned_mask(mask, seen)]
+
+
+def _evenly(places: np.ndarray, count: int) -> np.ndarray:
+    return places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)]
+
+
+def _clipped(saturation: float | None, frames: Sequence[Seen]) -> list[str]:
+    """Return the sentence for a level below full scale at which readings are clipped, or for eight bits in files of sixteen."""
+    top, full = max((each.top, each.full) for each in frames)
+    if full == LARGEST_INTEGER and round(top * full) == EIGHT_BITS:
+        return [f"frames[].image: the highest reading is {EIGHT_BITS} of {full}, as where 8 bits lie in 16-bit files: write them as 8-bit "
+                "images, which most cameras encode as srgb_texture"]
+    at = [each for each in frames if each.top == top]
+    spikes = [each for each in at if each.levels >= LEVELS and each.at_top > SPIKE * each.crowd]
+    limit = saturation or (1.0 if full else np.inf)
+    sizes = [each.at_top for each in spikes]
+    if sum(sizes) < FEWEST_CLIPPED or max(sizes) < UNLIKE * min(sizes) or top >= limit:
+        return []
+    told = f"{top:.4g}" + (f" ({round(top * full)} of {full})" if full else "")
+    return [f"saturation: many readings of {len(at)} images are {told}, and none is above: they are clipped there, and are taken for light "
+            f"that was measured: give saturation {np.floor(top * 1e5) / 1e5:.5g}"]
+
+
+def _other_colours(frames: Mapping[str, Seen]) -> list[str]:
+    """Return the sentence for channels whose ratios change from frame to frame, alike in nearly all pixels."""
+    readings = np.stack([each.inside for each in frames.values()])
+    grey = readings @ np.array(GREY_WEIGHTS)
+    lit = readings.min(axis=2) > LIT * np.percentile(grey, 99, axis=1, keepdims=True)
+    kept = lit.sum(axis=0) >= FEWEST_FRAMES
+    if kept.sum() < FEWEST_LIT:
+        return []
+    lit = lit[:, kept]
+    logs = np.log(np.where(lit[..., None], readings[:, kept], np.nan))
+    ratios = logs[..., [0, 2]] - logs[..., [1]]
+    usual = np.nanmedian(ratios, axis=0)
+    if _shape(grey) < CURVED and np.quantile(np.abs(usual - np.median(usual, axis=0)), PART) < SEVERAL:
+        return []
+    most = np.zeros(len(lit))
+    for index, seen in enumerate(lit):
+        if seen.sum() < max(FEWEST_LIT, MOST_LIT * kept.sum()):
+            continue
+        away = (ratios[index] - usual)[seen]
+        change = np.median(away, axis=0)
+        alike = np.quantile(np.abs(away - change), PART, axis=0) < ALIKE * np.abs(change)
+        most[index] = np.abs(change)[alike].max(initial=0)
+    index = int(most.argmax())
+    if (most > COLOURS).mean() < MANY:
+        return []
+    return [f"frames[].light.irradiance: the colours of the images change from one to the next, by {100 * np.expm1(most[index]):.0f} % in "
+            f"{list(frames)[index]}, as under automatic white balance or lamps of several colours: fix the white balance, or declare the "
+            "irradiance of each channel"]
+
+
+def _turned_mask(mask: np.ndarray, frames: Sequence[Seen]) -> list[str]:
+    """Return the sentence for a mask of all but the object."""
+    border = np.ones(mask.shape, dtype=bool)
+    border[1:-1, 1:-1] = False
+    parts, _ = ndimage.label(~mask)
+    at_border, left_out = np.isin(parts, np.unique(parts[border])), int((~mask).sum())
+    if mask[border].mean() < AROUND or left_out < LEFT_OUT * mask.size or (~mask & ~at_border).sum() < WITHIN * left_out:
+        return []
+    inside, outside = (np.stack(side) @ np.array(GREY_WEIGHTS) for side in ([each.inside for each in frames],
+                                                                            [each.outside for each in frames]))
+    dark = np.median(inside.max(axis=0)) < DARK * np.median(outside.max(axis=0))
+    flat = _shape(inside) < PLANE and _shape(outside) > SHAPED * _shape(inside)
+    return [f"mask: it reaches all around the image and leaves out what is within, which is {'brighter' if dark else 'no plane'}: if that "
+            "is the object, it is the mask of the background: invert it"] if dark or flat else []
+
+
+def _shape(readings: np.ndarray) -> float:
+    """Return the median residual of pixels [frames, pixels] that would all face one way."""
+    length = np.linalg.norm(readings, axis=0)
+    if not length.any():
+        return 0.0
+    shade = readings[:, length > 0] / length[length > 0]
+    return float(np.median(np.linalg.norm(shade - np.median(shade, axis=1, keepdims=True), axis=0)))
