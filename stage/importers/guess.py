@@ -20,7 +20,7 @@ from stage.importers.depth_frames import frame_layout, read_intrinsics
 from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, lit, made, tried
 from stage.importers.laser import NAMES as PLANES
 from stage.importers.laser import OFF_WORDS, read_planes
-from stage.importers.layout import image_names, read_lines
+from stage.importers.layout import image_names, read_json, read_lines
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
@@ -260,16 +260,30 @@ def _passed_over(folder: Folder) -> Iterator[str]:
     """Yield why tables of lights, or ones with a line for each image, are not those of the images."""
     count = len(folder.pictures)
     for path in folder.with_suffix(*TABLES):
-        if path.parent.absolute() != folder.path.absolute() or path.suffix.lower() in (".mat", ".npy", ".json"):
+        if path.parent.absolute() != folder.path.absolute():
             continue
         try:
             table = read_light_table(path)
         except StageError as error:
-            if 0 <= len(read_lines(path)) - count <= MOST_HEADINGS:
+            if count in _lengths(path):
                 yield f"{path.name} is no table of lights that can be read: {str(error).removeprefix(f'{path}: ')}"
         else:
             if table.names is None and len(table.vectors) > 2 and len(table.vectors) != count:
                 yield f"{path.name} holds {len(table.vectors)} lights, and there are {count} images: which belong together, nothing says"
+
+
+def _lengths(path: Path) -> set[int]:
+    """Return how many lights a table may hold that is not read as one."""
+    match path.suffix.lower():
+        case ".mat":
+            return {side for array in arrays_of(path).values() for side in array.shape}
+        case ".npy":
+            return set() if (array := tried(partial(read_array, path))) is None else set(array.shape)
+        case ".json":
+            data = tried(partial(read_json, path))
+            return {len(part) for part in (data, *(data.values() if isinstance(data, dict) else ())) if isinstance(part, list | dict)}
+    lines = len(read_lines(path))
+    return {lines - headings for headings in range(MOST_HEADINGS + 1)}
 
 
 def _not_there(folder: Folder, names: Sequence[str]) -> list[str]:

@@ -27,17 +27,16 @@ MOST = 1e300
 NUMBER_KEYS = ("id", "index", "idx", "i", "number", "num", "no", "no.", "nr", "nr.", "#", "n", "light", "led", "lamp", "frame")
 """Headings of a column that numbers the lights."""
 COMMENTS = ("#", "%", "//")
-FLAT = 0.2
-"""The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles."""
-HALF_TURN = 180.0
-"""Degrees above which a column without negative numbers is an azimuth, however long the radius beside it."""
+FLAT, HALF_TURN = 0.2, 180.0
+"""The length of a column that does not change, relative to that of the vectors, below which it is a radius beside two angles, and degrees
+above which a column without negative numbers is an azimuth, however long the radius beside it."""
 ROUND, QUARTER = 2 * np.pi, np.pi / 2 + 0.01
 """Most that azimuths and elevations in radians are, the second rounded up; azimuths of a dome span three quarters of a turn or more."""
-WHOLE, FRACTION = re.compile(r"-?\d+"), re.compile(r"0\d+")
-"""A whole number, and what stands behind a decimal comma as no whole number does."""
+WHOLE, FRACTION, THOUSANDS = re.compile(r"-?\d+"), re.compile(r"0\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+"""A whole number, what stands behind a decimal comma as no whole number does, and what a comma may part into thousands."""
 
 Run = str
-"""True if lights are the `rows` or the `columns` of a table of numbers."""
+"""`rows` or `columns`: which are the lights of a table of numbers."""
 
 
 class LightTable(NamedTuple):
@@ -78,7 +77,7 @@ def read_strengths(path: Path) -> np.ndarray:
         return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")
     _, rows, _ = _rows(path)
     try:
-        values = np.array([[float(part) for part in row] for _, row in rows], dtype=np.float64)
+        values = np.array([list(map(float, row)) for _, row in rows])
     except ValueError as error:
         raise ManifestError(f"{path}: must hold one or three numbers for each light") from error
     return _strengths(values, str(path))
@@ -99,8 +98,9 @@ def _variable(path: Path, arrays: Mapping[str, np.ndarray], wanted: str | None, 
         return wanted, arrays[wanted]
     fitting = {name: values for name, values in arrays.items() if values.ndim == 2 and set(values.shape) & set(sides)}
     if len(fitting) != 1:
-        raise ManifestError(f"{path}: holds {', '.join(arrays) or 'no array'}: " + ("name that of the lights with --variable" if arrays else
-                                                                                     "give a table of lights"))
+        held = ", ".join(f"{name} ({' x '.join(map(str, values.shape))})" for name, values in arrays.items())
+        raise ManifestError(f"{path}: holds {held or 'no array'}: " + (
+            "name that of the lights with --variable" if fitting else f"there must be {sides[-1]} numbers for each light"))
     return next(iter(fitting.items()))
 
 
@@ -124,36 +124,39 @@ def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
     for index, vector in enumerate(table.vectors):
         if not np.isfinite(vector).all() or not vector.any():
             raise ManifestError(f"{place(index)}: {' '.join(f'{value:g}' for value in vector)} is no direction and no position")
+    seen: set[str] = set()
     for index, name in enumerate(table.names or ()):
         if (fault := name_fault(name)) is not None:
             raise ManifestError(f"{place(index)}: the image name {ascii(name)[1:-1][:60]} {fault}")
-    if table.names is not None and len(set(table.names)) < len(table.names):
-        twice = next(index for index, name in enumerate(table.names) if name in table.names[:index])
-        raise ManifestError(f"{place(twice)}: names {table.names[twice]} a second time: each light has an image of its own")
+        if name in seen:
+            raise ManifestError(f"{place(index)}: names {name} a second time: each light has an image of its own")
+        seen.add(name)
     return table
 
 
 def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
-    """Return the headings of a text file in small letters, the number and the parts of each line, and the count in its first line."""
+    """Return the headings of a text file in small letters, the number and parts of each line, and the count in its first line."""
     lines = [(number, line) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
     separator = _separator([line for _, line in lines])
     fewest = min((numbers for _, line in lines if (numbers := _numbers_at_end(line)) > 2), default=0)
 
     def split(line: str) -> list[str]:
-        if separator is not None:
-            parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-        else:  # a name before the numbers may hold spaces
-            numbers = min(_numbers_at_end(line), fewest)
-            parts = line.rsplit(maxsplit=numbers) if numbers else line.split()
-        return [with_point(part.strip().strip('"').strip("'")) for part in parts]
+        numbers = min(_numbers_at_end(line), fewest)  # a name before them may hold spaces
+        parts = (line.rsplit(maxsplit=numbers) if numbers else line.split()) if separator is None else (
+            next(csv.reader([line], delimiter=separator, skipinitialspace=True)))
+        return [part.strip().strip('"').strip("'") for part in parts]
 
     rows = [(number, split(line)) for number, line in lines]
+    commas = [part for _, parts in rows for part in parts if with_point(part) != part]
+    if commas and all(map(THOUSANDS.fullmatch, commas)):
+        raise ManifestError(f"{path}: holds {commas[0]}, which may be a thousand or have decimals: write numbers with points and without "
+                            "marks of thousands")
+    rows = [(number, [with_point(part) for part in parts]) for number, parts in rows]
     count = None
     if len(rows) > 1 and len([part for part in rows[0][1] if part]) == 1 and rows[0][1][0].isdecimal() and len(rows[1][1]) > 1:
         count, rows = int(rows[0][1][0]), rows[1:]
-    headings = None
-    if rows and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1]):
-        headings, rows = [part.lower() for part in rows[0][1]], rows[1:]
+    headed = bool(rows) and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1])
+    headings, rows = ([part.lower() for part in rows[0][1]], rows[1:]) if headed else (None, rows)
     for number, parts in rows:
         whole = [part for part in parts if _number(part) is not None]
         if any(parts[len(headings):]) if headings else len(whole) in (6, 7) and all(map(WHOLE.fullmatch, whole)) and any(
@@ -241,12 +244,11 @@ def _check_angles(vectors: np.ndarray, what: str) -> None:
     for radius, angles in ((0, (1, 2)), (0, (2, 1)), (2, (0, 1)), (2, (1, 0))):
         length, given = vectors[:, radius], vectors[:, angles]
         turn, height = np.abs(given).T
-        if len(length) < 4 or np.ptp(length) > 0 or np.ptp(height) == 0:
-            continue
+        told = len(length) > 3 and np.ptp(length) == 0 < np.ptp(height)
         degrees = 90 < turn.max() <= 360 and height.max() <= 90 and (
             length[0] < FLAT * float(np.median(np.hypot(turn, height))) or (given.min() >= 0 and turn.max() > HALF_TURN))
         radians = np.ptp(given[:, 0]) > 0.75 * ROUND and turn.max() <= ROUND and given[:, 1].min() >= 0 and height.max() <= QUARTER
-        if degrees or radians:
+        if told and (degrees or radians):
             raise ManifestError(f"{what}: its columns look like two angles and a radius of {length[0]:g}: there must be x, y and z "
                                 "of each light")
 
@@ -291,9 +293,9 @@ def _without_headings(path: Path, rows: list[tuple[int, list[str]]], run: Run | 
     if uneven is not None:
         raise ManifestError(f"{path}: line {uneven}: has another count of numbers than the first line, {width}")
     values = np.array(parsed, dtype=np.float64)
+    if not named and len(values) == 3 and run is None and width in (3, 4, 6):
+        raise ManifestError(f"{path}: is 3 x {width}: say with --lights-in whether its rows or its columns are the lights")
     if not named and len(values) == 3 and run != "rows":
-        if run is None and width in (3, 4, 6):
-            raise ManifestError(f"{path}: is 3 x {width}: say with --lights-in whether its rows or its columns are the lights")
         return LightTable(None, values.T, None, "columns", str(path))
     if run == "columns" or width not in (3, 4, 6):
         raise ManifestError(f"{path}: has {len(values)} rows of {width} numbers: a light has three, and one or three of its strength")
@@ -308,8 +310,7 @@ def _from_json(path: Path, variable: str | None, run: Run | None) -> LightTable:
         key = variable or next((key for key in LIST_KEYS if key in data), None)
         if variable is not None and variable not in data:
             raise ManifestError(f"{path}: has no key {variable}, but {', '.join(map(str, data))[:200]}")
-        if key is not None:
-            data = data[key]
+        data = data if key is None else data[key]
     entries = list(data.items()) if isinstance(data, dict) else [(None, entry) for entry in data] if isinstance(data, list) else []
     if not entries:
         raise ManifestError(f"{path}: holds no list of lights" + ("" if variable else ": name its key with --variable"))
@@ -336,10 +337,8 @@ def _light(path: Path, index: int, key: str | None, entry: Any) -> tuple[str | N
         raise ManifestError(f"{path}: light {index + 1} is {str(entry)[:60]}: give a list of three numbers, or an object")
     small = {str(name).lower(): value for name, value in entry.items()}
     vector = first_of(small, VECTOR_KEYS)
-    if vector is None:
-        vector = [small.get(axis) for axis in "xyz"]
-    if isinstance(vector, dict):
-        vector = [vector.get(axis) for axis in "xyz"]
+    if vector is None or isinstance(vector, dict):
+        vector = [(vector or small).get(axis) for axis in "xyz"]
     strength = first_of(small, STRENGTH_KEYS)
     strength = [strength] * 3 if isinstance(strength, int | float) else strength
     for what, values in (("direction or position", vector), ("strength", strength)):

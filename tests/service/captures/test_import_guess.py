@@ -5,6 +5,7 @@ import shlex
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.ndimage import gaussian_filter
 
 from service.captures.importing import import_chosen, propose
@@ -294,6 +295,13 @@ def test_a_table_that_cannot_be_read_is_not_passed_over_in_silence(relit, tmp_pa
     (tmp_path / "angles.csv").write_text("".join(f"{k} 1 2\n" for k in range(10)))
     said = relit("import", "guess", tmp_path).well()
     assert "angles.csv holds 10 lights, and there are 9 images" in said and "sure     yes" not in said
+    (tmp_path / "angles.csv").unlink()
+    for name, write in (("six.npy", lambda path: np.save(path, np.ones((9, 6)))),
+                        ("two.mat", lambda path: savemat(path, {"dirs": np.ones((9, 3)), "strengths": np.ones((9, 3))})),
+                        ("angles.json", lambda path: path.write_text(json.dumps([{"azimuth": 1, "elevation": 2}] * 9)))):
+        write(tmp_path / name)
+        assert f"{name} is no table of lights that can be read" in relit("import", "guess", tmp_path).well()
+        (tmp_path / name).unlink()
 
 
 def test_photographs_that_are_there_twice_are_named_unless_a_list_names_one_of_them(relit, tmp_path):

@@ -276,7 +276,7 @@ def test_a_name_that_is_too_long(relit, tmp_path, command):
     relit(*arguments, tmp_path / ("y" * 5000)).refused("ile name too long")
 
 
-@pytest.mark.parametrize(("length", "words"), [(500, "file name too long"), (5000, "a.lp: line 2: the image name has 5004 characters")])
+@pytest.mark.parametrize(("length", "words"), [(500, "file name too long"), (5000, "has 5004 characters")])
 def test_a_name_of_an_lp_file_that_is_too_long(relit, tmp_path, length, words):
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
     (tmp_path / "a.lp").write_text(f"1\n{'x' * length}.png 0 0 1\n")

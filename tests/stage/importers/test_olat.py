@@ -174,6 +174,7 @@ def test_what_was_understood_is_told(folder):
     (rows(["4", "2", "3", "1"], X, Y, Z), {}, r"numbers its lights 4, 2, 3, 1"),
     ("-120 40 1\n30 60 1\n95 12 1\n170 80 1\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
     ("120 40 350\n30 60 350\n195 12 350\n270 80 350\n", {}, r"dirs\.txt: its columns look like two angles and a radius of 350"),
+    ('x,y,z\n"1,200","350","80"\n"-900","1,100","70"\n0,0,"1,500"\n0,-10,999\n', {}, r"dirs\.txt: holds 1,200, which may be a thousand"),
     ("0.7 -1.2 1\n1.1 0.4 1\n0.2 2.9 1\n0.6 -3 1\n", {"run": "rows"}, r"dirs\.txt: its columns look like two angles and a radius of 1"),
     ("".join(f"{name},0,05,0,5,0,8\n" for name in NAMES), {}, "line 1: has 7 cells: part columns by semicolons where numbers"),
     ("image,x,y,z\nIMG_2.JPG,0,5,0,3,0,8\n", {}, "line 2: has 7 cells under 4 headings: part columns by semicolons"),
