@@ -3,7 +3,6 @@
 A file of planes has rows of coefficients or of a point and a normal, or is a calibration file with entries of them.
 """
 
-import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,9 +32,9 @@ from stage.importers.layout import (
     image_names,
     image_resolution,
     read_json,
-    read_lines,
     write_capture,
 )
+from stage.importers.light_table import read_rows
 from stage.importers.opencv_file import read_matrices
 from stage.tof.raw_frames import read_array
 
@@ -94,29 +93,24 @@ def read_planes(path: Path) -> PlaneTable:
 
 
 def _from_text(path: Path) -> PlaneTable:
-    rows: list[list[float]] = []
-    names: list[str] = []
-    for number, line in read_lines(path):
-        text = line.partition("#")[0].strip()
-        if not text:
-            continue
-        parts = next(csv.reader([text], skipinitialspace=True)) if "," in text else text.replace(";", " ").split()
-        name = parts.pop(0) if Path(parts[0]).suffix.lower() in IMAGE_SUFFIXES else None
+    found, names = [], []
+    _, rows, _ = read_rows(path)
+    for number, parts in rows:
+        name = parts[0] if Path(parts[0]).suffix.lower() in IMAGE_SUFFIXES else None
         try:
-            values = [float(part) for part in parts]
+            values = [float(part) for part in (parts if name is None else parts[1:]) if part]
         except ValueError:
-            if not rows:
-                continue  # headings
             values = []
         if len(values) not in (4, 6):
-            raise ManifestError(f"{path}: line {number}: {text[:60]!r} is no plane: give four coefficients, or a point and a normal")
-        rows.append(values)
+            raise ManifestError(f"{path}: line {number}: {' '.join(parts)[:60]!r} is no plane: give four coefficients, or a point and a "
+                                "normal")
+        found.append(values)
         names += [] if name is None else [name]
-    if not rows:
+    if not found:
         raise ManifestError(f"{path}: holds no planes: give a row of four coefficients for each, or of a point and a normal")
-    if len({len(row) for row in rows}) > 1 or len(names) not in (0, len(rows)):
+    if len({len(row) for row in found}) > 1 or len(names) not in (0, len(found)):
         raise ManifestError(f"{path}: its rows differ: each has four numbers or each has six, and all have an image name or none")
-    return _table(path, np.array(rows), tuple(names) or None)
+    return _table(path, np.array(found), tuple(names) or None)
 
 
 def _objects(path: Path) -> PlaneTable | None:

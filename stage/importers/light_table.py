@@ -75,7 +75,7 @@ def read_strengths(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".mat":
         name, values = _variable(path, read_mat_arrays(path), None, sides=(1, 3))
         return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")
-    _, rows, _ = _rows(path)
+    _, rows, _ = read_rows(path)
     try:
         values = np.array([list(map(float, row)) for _, row in rows])
     except ValueError as error:
@@ -134,14 +134,15 @@ def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
     return table
 
 
-def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
+def read_rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
     """Return the headings of a text file in small letters, the number and parts of each line, and the count in its first line."""
-    lines = [(number, line) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
+    lines = [(number, line.partition(" #")[0]) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
     separator = _separator([line for _, line in lines])
     fewest = min((numbers for _, line in lines if (numbers := _numbers_at_end(line)) > 2), default=0)
 
     def split(line: str) -> list[str]:
-        numbers = min(_numbers_at_end(line), fewest)  # a name before them may hold spaces
+        numbers = _numbers_at_end(line)
+        numbers = numbers if numbers == len(line.split()) else min(numbers, fewest)  # a name before them may hold spaces and numbers
         parts = (line.rsplit(maxsplit=numbers) if numbers else line.split()) if separator is None else (
             next(csv.reader([line], delimiter=separator, skipinitialspace=True)))
         return [part.strip().strip('"').strip("'") for part in parts]
@@ -189,7 +190,7 @@ def _number(text: str) -> float | None:
 
 
 def _from_text(path: Path, run: Run | None) -> LightTable:
-    headings, rows, count = _rows(path)
+    headings, rows, count = read_rows(path)
     if not rows:
         raise ManifestError(f"{path}: holds no light")
     named = None if headings is None else _named(headings, rows)

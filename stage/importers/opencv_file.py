@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from stage.capture.camera import Distortion
-from stage.errors import ManifestError, storage
+from stage.errors import ManifestError
+from stage.importers.layout import read_text
 from stage.transforms import OPENCV_FROM_CAMERA
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
@@ -23,8 +24,7 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
     """Read every matrix and number of a file. Returns the float64 arrays, of one or two dimensions, by their names."""
     if path.suffix.lower() not in SUFFIXES:
         raise ManifestError(f"{path}: is no OpenCV calibration: its suffix must be one of {', '.join(SUFFIXES)}")
-    with storage("read", path):
-        text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path)
     if path.suffix.lower() == ".json":
         return _from_json(path, text)
     try:
@@ -33,7 +33,10 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
         found = {}
         for name in root.keys():  # noqa: SIM118 - a FileNode, not a mapping
             node = root.getNode(name)
-            if node.isMap():
+            if node.isMap() and node.getNode("dt").empty():  # as ROS writes the calibration of a camera
+                rows, cols, data = (node.getNode(part) for part in ("rows", "cols", "data"))
+                found[name] = np.array([data.at(i).real() for i in range(data.size())]).reshape(int(rows.real()), int(cols.real()))
+            elif node.isMap():
                 found[name] = np.asarray(node.mat(), dtype=np.float64)
             elif node.isReal() or node.isInt():
                 found[name] = np.array([node.real()])

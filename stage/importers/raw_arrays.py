@@ -88,13 +88,14 @@ class ArrayFiles:
                                 f"({one} bytes)")
         values = np.frombuffer(content, kind)
         other = values.view(kind.newbyteorder())
-        if len(values) >= LEAST_NUMBERS and (_misread if kind.kind == "f" else _rougher)(values, other, (1, width, width * height)):
+        if len(values) >= LEAST_NUMBERS and (_misread(values, other) if kind.kind == "f" else
+                                             _rougher(values, other, (1, width, width * height))):
             raise ManifestError(f"--dtype {self.dtype}: the numbers of {path} are {other.dtype.str}, in the other order of their bytes, in "
                                 f"which neighbours are alike: give --dtype '{other.dtype.str}'")
         return values.reshape(-1, height, width)
 
 
-def _misread(values: np.ndarray, other: np.ndarray, _: tuple[int, ...]) -> bool:
+def _misread(values: np.ndarray, other: np.ndarray) -> bool:
     """Return whether most numbers of floating point are of no measurement, and in the other order of bytes all are."""
     def measured(numbers: np.ndarray) -> float:
         size = np.abs(numbers[numbers != 0])

@@ -70,6 +70,13 @@ def as_text(folder):
     return "laser_planes.txt", "zero"  # of any length
 
 
+def with_commas(folder):
+    """As a spreadsheet of another country writes it."""
+    (folder / "planes.csv").write_text("a;b;c;d\n" + "\n".join(";".join(f"{v:.9f}" for v in row) for row in 3 * coefficients())
+                                       .replace(".", ","), encoding="utf-16")
+    return "planes.csv", "zero"
+
+
 def as_yaml(folder):
     file = cv2.FileStorage(str(folder / "laser.yml"), cv2.FILE_STORAGE_WRITE)
     file.write("laser_planes", coefficients(1.0))
@@ -94,7 +101,7 @@ def as_points(folder):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("write", [as_csv, as_text, as_yaml, as_mat, as_json, as_points])
+@pytest.mark.parametrize("write", [as_csv, as_text, with_commas, as_yaml, as_mat, as_json, as_points])
 def test_planes_of_any_file_give_the_true_depth(relit, tmp_path, write):
     """The stripe is 1.2 px wide (standard deviation) and the baseline 0.3 m: the texture
     moves a stripe by tenths of a pixel, each of which is 1.2 mm of depth."""

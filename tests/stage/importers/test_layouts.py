@@ -12,6 +12,7 @@ from stage.capture.projector import UncalibratedProjector
 from stage.errors import ImageError, ManifestError, StorageError
 from stage.importers import diligent, lp
 from stage.importers.guess import guess
+from stage.importers.opencv_file import read_matrices
 from stage.importers.pattern_order import GrayStack
 from stage.importers.patterns import import_opencv_gray as import_folder
 from tests.scenes.captures import files_in, nothing_written, write_exr, write_image
@@ -349,6 +350,17 @@ def test_a_calibration_says_where_the_projector_is(scan, tmp_path, suffix, names
     truth = cv2.projectPoints(points * (1000, -1000, -1000), cv2.Rodrigues(R)[0], T, K2, D2)[0][:, 0] + 0.5
     found, ahead = manifest.projector.project(points)
     assert ahead.all() and np.abs(found - truth).max() < 1e-6
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(("name", "text"), [
+    ("camera.json", json.dumps({"camera_matrix": K1.tolist(), "image_width": 640})),
+    ("ros.yaml", "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [800, 0, 319.5, 0, 810, 239.5, 0, 0, 1]\n")])
+def test_calibrations_of_other_programs(tmp_path, name, text, encoding):
+    """As ROS writes them, and editors of Windows."""
+    (tmp_path / name).write_bytes(text.encode(encoding))
+    found = read_matrices(tmp_path / name)
+    assert np.array_equal(found["camera_matrix"], K1) and found["image_width"] == 640
 
 
 def test_plain_lists_in_json(scan, tmp_path):
