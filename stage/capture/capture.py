@@ -87,7 +87,7 @@ class Capture:
         capture = capture._exposed(headers)
         capture = replace(capture, doubts=(*capture.doubts, *capture._other_spaces(headers), *capture._other_encodings(headers),
                                            *capture._other_pixels(headers), *capture._other_depths(headers),
-                                           *other_sizes(capture.manifest), *capture.manifest.assumed))
+                                           *capture._without_colours(headers), *other_sizes(capture.manifest), *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -267,6 +267,12 @@ class Capture:
         return [f"frames[].image: {len(few)} of the {len(headers)} images, {few[0]} the first of them, have 8 bits and the others more, as "
                 f"where previews lie beside their originals: all are read as {self.manifest.color_space}; give images of one kind"
                 ] if 0 < len(few) < len(headers) else []
+
+    def _without_colours(self, headers: Mapping[str, ImageHeader]) -> list[str]:
+        """Return a sentence where some images are grey and others have colours."""
+        grey = sorted(name for name, header in headers.items() if header.channels == 1)
+        return [f"frames[].image: {len(grey)} of the {len(headers)} images, {grey[0]} the first of them, are grey and the others have "
+                "colours, whose weights in grey nobody knows: give images of one kind"] if 0 < len(grey) < len(headers) else []
 
     def _check_files(self) -> dict[str, ImageHeader]:
         """Check the header of every file, and return those of frames by the names of their images."""

@@ -195,7 +195,8 @@ def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None =
     values = read_mask_values(path, resolution)
     mask = (values if crop is None else crop.of(values)) > 0.5
     if not mask.any():
-        raise ImageError(f"{path}: the mask is empty{'' if crop is None else f' in --crop {crop}'}: no pixel is above one half")
+        raise ImageError(f"{path}: the mask is empty{'' if crop is None else f' in --crop {crop}'}: no pixel is above one half in its "
+                         f"first channel, the highest is {values.max():.3g} of 1: the object is to be white")
     return mask
 
 

@@ -16,6 +16,7 @@ from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.manifest import Frame
 from stage.colour.colour import GREY_WEIGHTS, LARGEST_INTEGER
+from stage.formats import images
 from stage.stack.correction import Correction
 
 PIXELS, READ, MOST_FRAMES = 2000, 300_000, 12
@@ -44,6 +45,10 @@ DARK, PLANE, SHAPED = 0.2, 0.1, 3.0
 """Brightness of what the mask has over that of what it leaves out, and residual of one normal there, below which it is none of the object;
 and how many times that residual is of what it leaves out."""
 
+ALPHA = (2, 4)
+"""Counts of the channels of images with alpha."""
+CLEAR = "mask: it is white everywhere and has alpha, which is not read: write the object white and the rest black"
+
 
 class Seen(NamedTuple):
     """What one frame shows."""
@@ -67,6 +72,7 @@ def said_by_readings(capture: Capture, most: int = MOST_FRAMES) -> list[str]:
     if len(lit) < FEWEST_FRAMES or capture.is_polarised:
         return []
     mask, correction = capture.mask(), Correction.of(capture)
+    clear = mask.all() and capture.manifest.mask is not None and images.read_header(capture.file(capture.manifest.mask)).stored in ALPHA
     inside, outside = np.flatnonzero(mask), np.flatnonzero(~mask)
     some = [(places, correction.at(places)) for places in (_evenly(inside, PIXELS), _evenly(outside, PIXELS))]
     read = _evenly(inside, READ)
@@ -82,7 +88,7 @@ def said_by_readings(capture: Capture, most: int = MOST_FRAMES) -> list[str]:
 
     frames = {lit[index][0].image: see(*lit[index]) for index in _evenly(np.arange(len(lit)), most)}
     seen = list(frames.values())
-    return [*_clipped(capture.manifest.saturation, seen), *_other_colours(frames), *_turned_mask(mask, seen)]
+    return [*_clipped(capture.manifest.saturation, seen), *_other_colours(frames), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
 
 
 def _evenly(places: np.ndarray, count: int) -> np.ndarray:

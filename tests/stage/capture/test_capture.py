@@ -45,6 +45,14 @@ def test_another_colour_space_in_the_images_is_said(tmp_path):
     assert Capture.open(tmp_path).doubts == ()
 
 
+def test_grey_images_among_coloured_ones_are_said(tmp_path):
+    write_capture(tmp_path, SCENE)
+    for index in range(4):
+        write_exr(tmp_path / f"{index:03d}.exr", SCENE.images[index].mean(axis=-1))
+        doubts = Capture.open(tmp_path).doubts
+        assert ("000.exr the first of them, are grey" in " ".join(doubts)) == (index < 3)
+
+
 def test_encodings_that_files_declare_are_said(tmp_path):
     """EXR images that OpenImageIO made of photographs, and Radiance images of another gamma: both were taken as linear without a word."""
     write_capture(tmp_path, SCENE)

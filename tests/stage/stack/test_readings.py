@@ -70,6 +70,14 @@ def test_a_mask_of_the_background_is_said(tmp_path, ground, words):
     assert not said_by_readings(capture(tmp_path, images, mask=mask))
 
 
+def test_a_mask_in_alpha_is_said(tmp_path):
+    found = capture(tmp_path, noisy(0.5 * SHINING))
+    for colour, told in ((np.full_like(SCENE.mask, True), True), (SCENE.mask, False)):
+        layers = [*[np.where(colour, 255, 0)] * 3, np.where(SCENE.mask, 255, 0)]
+        write_image(tmp_path / "mask.png", np.stack(layers, axis=-1).astype(np.uint8))
+        assert [said.startswith("mask: it is white everywhere") for said in said_by_readings(found)] == [True] * told
+
+
 def test_an_import_records_it(tmp_path):
     capture(tmp_path, np.minimum(1.2 * SHINING, 1), full=4095)
     (tmp_path / "capture.json").unlink()
