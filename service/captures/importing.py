@@ -50,7 +50,8 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     try:
         capture = Capture.open(imported.path)
         seen = said_by_readings(capture)
-        said = [("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in (*capture.doubts, *seen)]
+        said = [("assumed" if doubt in manifest.assumed else "finding", doubt)
+                for doubt in (*capture.doubts, *seen) if doubt not in assumed]
     except StageError as error:  # of an image, which the import need not have looked at
         said = [*(("assumed", sentence) for sentence in manifest.assumed), ("fault", str(error))]
     more = tuple(sentence for sentence in (*assumed, *seen) if sentence not in manifest.assumed)
@@ -73,10 +74,11 @@ def _lp(request: LpImport) -> Imported:
 
 
 def _opencv_gray(request: OpencvGrayImport) -> Imported:
-    from stage.importers.patterns import import_opencv_gray
+    from stage.importers.pattern_order import GrayStack
+    from stage.importers.patterns import PatternImages, import_gray
 
-    return Imported(import_opencv_gray(request.source, request.folder, projector=request.projector, calibration=request.calibration,
-                                       unit_m=request.unit_m), ())
+    return import_gray(request.source, request.folder, gray=GrayStack(), pictures=PatternImages(
+        projector=request.projector, calibration=request.calibration, unit_m=request.unit_m))
 
 
 def _olat(request: OlatImport) -> Imported:

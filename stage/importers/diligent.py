@@ -10,22 +10,18 @@ from pathlib import Path
 from stage.errors import ManifestError
 from stage.formats import images
 from stage.importers.camera_options import mask_beside
-from stage.importers.layout import doubled_lights, image_resolution, read_lines, read_table, write_capture
+from stage.importers.layout import doubled_lights, image_resolution, read_lines, write_capture
+from stage.importers.light_table import read_light_table, read_strengths
 
 
 def import_folder(source: Path, destination: Path) -> Path:
     """Write a capture.json for an object of the DiLiGenT benchmark."""
     names = [line for _, line in read_lines(source / "filenames.txt")]
-    directions = read_table(source / "light_directions.txt", 3)
-    intensities = read_table(source / "light_intensities.txt", 3)
+    directions = read_light_table(source / "light_directions.txt", run="rows").vectors
+    intensities = read_strengths(source / "light_intensities.txt")
     for name, table in (("light_directions.txt", directions), ("light_intensities.txt", intensities)):
         if len(table) != len(names):
             raise ManifestError(f"{source / name}: has {len(table)} rows, filenames.txt names {len(names)} images")
-    if not names:
-        raise ManifestError(f"{source / 'filenames.txt'}: names no image")
-    zero = [i for i, row in enumerate(directions) if not row.any()]
-    if zero:
-        raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
     resolution = image_resolution(source / names[0])
     linear = [] if not images.read_header(source / names[0]).eight_bits else [
         f"color_space: {names[0]} has 8 bits and was taken as linear, as the 16 bits of the benchmark are: JPEG images and most "

@@ -12,7 +12,7 @@ import numpy as np
 from stage.capture.manifest import FILE_NAME
 from stage.errors import StageError, storage
 from stage.formats.mat_file import read_mat_arrays
-from stage.importers.layout import color_space_of
+from stage.importers.layout import assumed_encoding, color_space_of
 from stage.importers.opencv_file import read_matrices
 
 T = TypeVar("T")
@@ -89,11 +89,10 @@ def tried(read: Callable[[], T]) -> T | None:
         return None
 
 
-def encoding(folder: Folder) -> tuple[str, ...]:
-    """Return what is assumed of the encoding of 8-bit images."""
-    if tried(partial(color_space_of, folder.path / folder.pictures[0])) != "srgb_texture":
-        return ()
-    return ("the images have 8 bits and are taken as sRGB: many of cameras for measurements are linear, --color-space lin_rec709_scene",)
+def encoding(folder: Folder) -> list[str]:
+    """Return what the import assumes of the encoding of 8-bit images, as its manifest says it."""
+    space = tried(partial(color_space_of, folder.path / folder.pictures[0]))
+    return [] if space is None else assumed_encoding(space)
 
 
 def group_of(folder: Folder, count: int) -> list[str] | None:

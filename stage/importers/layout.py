@@ -87,20 +87,6 @@ def first_of(values: Mapping[str, T], names: Iterable[str]) -> T | None:
     return next((values[name] for name in names if name in values), None)
 
 
-def read_table(path: Path, columns: int) -> np.ndarray:
-    """Read a text file with rows of numbers that white space separates: [rows, columns] float64."""
-    rows = []
-    for number, line in read_lines(path):
-        try:
-            row = [float(part) for part in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            raise ManifestError(f"{path}: line {number}: {line[:60]!r} is not {columns} numbers")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
-
-
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file."""
     try:

@@ -148,35 +148,6 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
     return _write(source, destination, pictures, CODECS[codec](size, axes), (), shifted=codec in HALF_PIXEL)
 
 
-def import_opencv_gray(source: Path, destination: Path, *, projector: tuple[int, int], calibration: Path | None = None,
-                       unit_m: float = 1.0) -> Path:
-    """Write a capture.json for images in the order of OpenCV's GrayCodePattern: columns, rows, white, black.
-
-    Args:
-        source: the folder of the images, which are taken in the natural order of their names: 2 before 10.
-        projector: the width and height of the projector in pixels, which determine the count of bits.
-        calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`, and
-            the manifest has the size of the projector alone.
-        unit_m: the metres in one unit of T.
-    """
-    names = image_names(source)
-    patterns = GrayStack().entries(projector)
-    if len(names) != len(patterns):
-        raise ManifestError(f"{source}: holds {len(names)} images, a projector of {projector[0]}x{projector[1]} px takes {len(patterns)}: "
-                            "columns and rows with inverses, white, black")
-    resolution = image_resolution(source / names[0])
-    data: dict[str, Any] = {
-        "name": source.resolve().name,
-        "color_space": "lin_rec709_scene",
-        "camera": {"projection": "orthographic", "resolution": resolution},
-        "projector": {"resolution": projector},
-    }
-    if calibration is not None:
-        data |= camera_and_projector(calibration, resolution, projector, unit_m)
-    data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in zip(names, patterns, strict=True)]
-    return write_capture(data, source / names[0], destination)
-
-
 def _slstudio_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
     """SLStudio's CodecGrayCode: white, black, the coarsest ten bits of the columns, the coarsest six of the rows; no inverses."""
     parts = tuple(f"{axis}s" for axis in axes)

@@ -14,7 +14,7 @@ from stage.importers import diligent, lp
 from stage.importers.guess import guess
 from stage.importers.opencv_file import read_matrices
 from stage.importers.pattern_order import GrayStack
-from stage.importers.patterns import import_opencv_gray as import_folder
+from stage.importers.patterns import PatternImages, import_gray
 from tests.scenes.captures import files_in, nothing_written, write_exr, write_image
 
 NAMES = ["001.png", "002.png", "003.png", "004.png"]
@@ -76,12 +76,12 @@ def test_without_a_mask(object_folder):
 
 
 @pytest.mark.parametrize(("file", "text", "words"), [
-    ("light_directions.txt", "0 0 1\n0 up 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: '0 up 1' is not 3 numbers"),
-    ("light_directions.txt", "0 0 1\n\n0 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 3: '0 1' is not 3 numbers"),
-    ("light_directions.txt", "0 0 1\n0 nan 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: '0 nan 1' is not 3 numbers"),
-    ("light_directions.txt", "0 0 1\n0 0 1\n0 0 0\n0 0 1\n", r"light_directions\.txt: row 3 has zero length"),
+    ("light_directions.txt", "0 0 1\n0 up 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: '0 up 1' is not three numbers"),
+    ("light_directions.txt", "0 0 1\n\n0 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 3: has another count of numbers"),
+    ("light_directions.txt", "0 0 1\n0 nan 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: 0 nan 1 is no direction"),
+    ("light_directions.txt", "0 0 1\n0 0 1\n0 0 0\n0 0 1\n", r"light_directions\.txt: line 3: 0 0 0 is no direction"),
     ("light_directions.txt", "0 0 1\n", r"light_directions\.txt: has 1 rows, filenames\.txt names 4"),
-    ("light_intensities.txt", "", r"light_intensities\.txt: has 0 rows, filenames\.txt names 4"),
+    ("light_intensities.txt", "", r"light_intensities\.txt: must hold one or three"),
     ("light_intensities.txt", table([(1, 1, 1)] * 3 + [(1, -1, 1)]), r"frames\[3\]\.light\.irradiance\[1\]: is -1\.0"),
     ("light_intensities.txt", table([(1, 1, 1)] * 3 + [(0, 0, 0)]), r"frames\[3\]\.light\.irradiance: is zero in every channel"),
     ("filenames.txt", "001.png\n002.png\n001.png\n004.png\n", r"filenames\.txt: frames\[2\]\.image: 001\.png is already"),
@@ -107,7 +107,7 @@ def test_a_missing_table_is_named(object_folder, name):
 def test_an_empty_object(object_folder):
     for name in ("filenames.txt", "light_directions.txt", "light_intensities.txt"):
         (object_folder / name).write_text("\n")
-    with pytest.raises(ManifestError, match=r"filenames\.txt: names no image"):
+    with pytest.raises(ManifestError, match=r"light_directions\.txt: holds no light"):
         diligent.import_folder(object_folder, object_folder)
 
 
@@ -310,6 +310,10 @@ def test_a_first_image_that_is_none(tmp_path):
     assert "capture.json" not in files_in(tmp_path)
 
 
+def import_folder(source, destination, **options):
+    return import_gray(source, destination, pictures=PatternImages(**options), gray=GrayStack())
+
+
 @pytest.fixture
 def scan(tmp_path):
     folder = tmp_path / "scan"
@@ -371,7 +375,7 @@ def test_plain_lists_in_json(scan, tmp_path):
 
 
 def test_bad_input_is_named(scan, tmp_path):
-    with pytest.raises(ManifestError, match="holds 16 images, a projector of 32x6 px takes 18"):
+    with pytest.raises(ManifestError, match=r"has 16 images .* where these options have 18 patterns"):
         import_folder(scan, scan, projector=(32, 6))
     with pytest.raises(ManifestError, match="holds no translation T"):
         import_folder(scan, scan, projector=(16, 6), calibration=write_calibration(tmp_path / "a.yml", FILES["moreno"][:5],
