@@ -39,9 +39,8 @@ LOOKED_FOR = ("photographs with a table, a list or a rig of lights; four or more
               "stripes of a laser; arrays of a time-of-flight camera or of photon counts")
 """The layouts, in words."""
 
-MOST_HEADINGS = 2
-"""Lines of a table of lights before the first light: its count and its headings."""
-
+NUMBER = re.compile(r"(?<![^\s;,])[-+]?\d*[.]?\d+(?:[eE][-+]?\d+)?(?![^\s;,])")
+"""A number in a line of a table."""
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
 """Words in the names of files that hold planes, and of images of a stripe."""
 
@@ -282,8 +281,7 @@ def _lengths(path: Path) -> set[int]:
         case ".json":
             data = tried(partial(read_json, path))
             return {len(part) for part in (data, *(data.values() if isinstance(data, dict) else ())) if isinstance(part, list | dict)}
-    lines = len(read_lines(path))
-    return {lines - headings for headings in range(MOST_HEADINGS + 1)}
+    return {sum(len(NUMBER.findall(line)) > 1 for _, line in read_lines(path))}
 
 
 def _not_there(folder: Folder, names: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ import os
 import shutil
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -61,9 +62,22 @@ def image_named(given: str, names: Sequence[str]) -> str | None:
     last = given.replace("\\", "/").rsplit("/", 1)[-1]
     if last in names:
         return last
-    stem, whole = (unicodedata.normalize("NFC", text).lower() for text in (Path(last).stem, last))
-    alike = [name for name in names if unicodedata.normalize("NFC", Path(name).stem).lower() in (stem, whole)]  # macOS takes umlauts apart
-    return alike[0] if len(alike) == 1 else None
+    by_stem = _by_stem(tuple(names))
+    alike = {name for text in (Path(last).stem, last) for name in by_stem.get(_plain(text), ())}
+    return alike.pop() if len(alike) == 1 else None
+
+
+def _plain(text: str) -> str:
+    return unicodedata.normalize("NFC", text).lower()  # macOS takes umlauts apart
+
+
+@lru_cache(maxsize=2)
+def _by_stem(names: tuple[str, ...]) -> dict[str, list[str]]:
+    """Return names by their stems."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(_plain(Path(name).stem), []).append(name)
+    return found
 
 
 def read_text(path: Path) -> str:

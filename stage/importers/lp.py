@@ -75,11 +75,14 @@ def read_lights(source: Path) -> LightList:
     table = read_light_table(path, run="rows")
     if table.names is None:
         raise ManifestError(f"{path}: names no images: relit import olat takes lights in the order of the images")
-    images = {folder: _images(folder, table.names) for folder in (path.parent, path.absolute().parent.parent)}
-    missing = {folder: [name for name in names if not inputs.is_file(folder / name)] for folder, names in images.items()}
-    folder = min(images, key=lambda folder: len(missing[folder]))
-    names = images[folder]
-    if lost := missing[folder]:
+    found: list[tuple[Path, list[str], list[str]]] = []
+    for near in (path.parent, path.absolute().parent.parent):
+        names = _images(near, table.names)
+        found.append((near, names, [name for name in names if not inputs.is_file(near / name)]))
+        if not found[-1][2]:
+            break
+    folder, names, lost = min(found, key=lambda one: len(one[2]))
+    if lost:
         more = f", and {len(lost) - 1} more are not" if len(lost) > 1 else ""
         raise ManifestError(f"{path}: its image {lost[0]} is not in the folder{more}: find the images, or take their lines out")
     first: dict[str, str] = {}

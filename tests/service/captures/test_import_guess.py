@@ -288,6 +288,7 @@ def test_a_table_of_other_images_is_none(relit, tmp_path):
 def test_a_table_that_cannot_be_read_is_not_passed_over_in_silence(relit, tmp_path):
     for number, image in enumerate(make_scene(12, 9).images):
         write_image(tmp_path / f"{number}.png", np.round(image / image.max() * 60000).astype(np.uint16))
+    (tmp_path / "names.txt").write_text("".join(f"photo {k}.png of 2024-05-0{k + 1}\n" for k in range(9)))
     assert "sure     yes" in relit("import", "guess", tmp_path).well()
     (tmp_path / "angles.csv").write_text("azimuth,elevation\n" + "".join(f"{40 * k},{50 + k}\n" for k in range(9)))
     said = relit("import", "guess", tmp_path).well()
