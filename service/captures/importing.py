@@ -46,18 +46,19 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     `assumed`: what was taken for granted by who chose the layout, which the manifest then records. Raises ManifestError if the files do not
     hold what the layout has, or do not fit the options."""
     imported = _IMPORTS[type(request)](request)
-    manifest, seen = read_manifest(imported.path), []
+    manifest = read_manifest(imported.path)
+    doubts, seen, faults = manifest.assumed, list[str](), list[tuple[str, str]]()
     try:
         capture = Capture.open(imported.path)
+        doubts = capture.doubts
         seen = said_by_readings(capture)
-        said = [("assumed" if doubt in manifest.assumed else "finding", doubt)
-                for doubt in (*capture.doubts, *seen) if doubt not in assumed]
     except StageError as error:  # of an image, which the import need not have looked at
-        said = [*(("assumed", sentence) for sentence in manifest.assumed), ("fault", str(error))]
+        faults = [("fault", str(error))]
+    said = [("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in (*doubts, *seen) if doubt not in assumed]
     more = tuple(sentence for sentence in (*assumed, *seen) if sentence not in manifest.assumed)
     if more:
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
-    return imported._replace(facts=(*imported.facts, *said))
+    return imported._replace(facts=(*imported.facts, *said, *faults))
 
 
 def _diligent(request: DiligentImport) -> Imported:

@@ -10,6 +10,7 @@ from service.captures.info import front_lights
 from stage.capture.capture import Capture
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, make_scene, render, write_exr, write_image
+from tests.stage.stack.test_readings import SHINING, capture
 
 
 def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path):
@@ -181,3 +182,17 @@ def test_what_files_say_beside_the_manifest_is_told_at_once(relit, tmp_path):
     assert "finding  color_space: lin_rec709_scene is declared, and lin_ap1_scene by 3" in relit("import", "photos", tmp_path).well()
     write_exr(tmp_path / "4.exr", np.zeros((4, 4, 3)))
     assert "4.exr: is 4x4, camera.resolution says 8x8" in relit("import", "photos", tmp_path).well()
+
+
+def test_what_readings_show_is_recorded(relit, tmp_path):
+    capture(tmp_path, np.minimum(1.2 * SHINING, 1), full=4095)
+    (tmp_path / "capture.json").unlink()
+    said, = (line for line in relit("import", "photos", tmp_path).well().splitlines() if line.startswith("finding  saturation:"))
+    assert said.removeprefix("finding  ") in Capture.open(tmp_path).doubts
+
+
+def test_an_image_that_cannot_be_read_takes_nothing_from_what_headers_say(relit, tmp_path):
+    for number, image in enumerate(make_scene(8, 4).images):
+        write_exr(tmp_path / f"{number}.exr", image - (number == 2), **({"colorInteropID": "lin_ap1_scene"} if number else {}))
+    said = relit("import", "photos", tmp_path).well()
+    assert "finding  color_space:" in said and "fault    " in said and "2.exr: 64 pixels are negative" in said

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from service.captures.importing import import_files
-from service.requests.imports.lights import PhotosImport
 from stage.capture.capture import Capture
 from stage.stack.readings import said_by_readings
 from tests.scenes.captures import make_scene, manifest_of, write_image, write_manifest
@@ -76,11 +74,3 @@ def test_a_mask_in_alpha_is_said(tmp_path):
         layers = [*[np.where(colour, 255, 0)] * 3, np.where(SCENE.mask, 255, 0)]
         write_image(tmp_path / "mask.png", np.stack(layers, axis=-1).astype(np.uint8))
         assert [said.startswith("mask: it is white everywhere") for said in said_by_readings(found)] == [True] * told
-
-
-def test_an_import_records_it(tmp_path):
-    capture(tmp_path, np.minimum(1.2 * SHINING, 1), full=4095)
-    (tmp_path / "capture.json").unlink()
-    imported = import_files(PhotosImport(source=tmp_path))
-    sentence, = (sentence for what, sentence in imported.facts if what == "finding" and sentence.startswith("saturation:"))
-    assert sentence in Capture.open(tmp_path).doubts
