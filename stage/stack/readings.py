@@ -66,8 +66,8 @@ class Seen(NamedTuple):
     outside: np.ndarray  # the same of what the mask leaves out
 
 
-def said_by_readings(capture: Capture, most: int = MOST_FRAMES) -> list[str]:
-    """Return a sentence for each of these that some frames of a capture under lights show; `most`: the frames that are read, evenly."""
+def said_by_readings(capture: Capture) -> list[str]:
+    """Return a sentence for each of these that some frames of a capture under lights show."""
     lit = [(frame, frame.light) for frame in capture.manifest.frames if isinstance(frame.light, DistantLight | PointLight)]
     if len(lit) < FEWEST_FRAMES or capture.is_polarised:
         return []
@@ -82,11 +82,12 @@ def said_by_readings(capture: Capture, most: int = MOST_FRAMES) -> list[str]:
         flat, full = recorded.reshape(-1, 3), int(np.iinfo(recorded.dtype).max) if recorded.dtype.kind == "u" else 0
         values, counts = np.unique(flat[read], return_counts=True)
         near = counts[:-1][values[:-1] >= NEAR_TOP * values[-1]]
-        strength = light.irradiance if isinstance(light, DistantLight) else light.intensity
+        strength = np.array(light.irradiance if isinstance(light, DistantLight) else light.intensity, np.float32)
+        strength[strength == 0] = np.inf  # a channel without light shows nothing
         return Seen(full, float(values[-1]) / (full or 1), int(counts[-1]), int(near.max(initial=0)), len(near),
-                    *(at.corrected(flat[places][:, None], frame)[:, 0] / np.array(strength, np.float32) for places, at in some))
+                    *(at.corrected(flat[places][:, None], frame)[:, 0] / strength for places, at in some))
 
-    frames = {lit[index][0].image: see(*lit[index]) for index in _evenly(np.arange(len(lit)), most)}
+    frames = {lit[index][0].image: see(*lit[index]) for index in _evenly(np.arange(len(lit)), MOST_FRAMES)}
     seen = list(frames.values())
     return [*_clipped(capture.manifest.saturation, seen), *_other_colours(frames), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
 

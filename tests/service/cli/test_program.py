@@ -142,7 +142,7 @@ def test_import_diligent_and_look_at_it(relit, tmp_path):
     assert Capture.open(tmp_path / "ball").name == "ballPNG"
     (source / "light_directions.txt").write_text("0 0 1\n0 0 0\n0 0.5 1\n")
     outcome = relit("import", "diligent", source, tmp_path / "other")
-    assert outcome == (2, "", f"relit: {source / 'light_directions.txt'}: row 2 has zero length: give a direction\n")
+    assert outcome == (2, "", f"relit: {source / 'light_directions.txt'}: line 2: 0 0 0 is no direction and no position\n")
     assert not (tmp_path / "other").exists()
 
 

@@ -1,5 +1,7 @@
 """What the readings of a capture show and its manifest does not say: clipping below full scale, other colours, a mask of all else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,14 @@ def test_a_mask_of_the_background_is_said(tmp_path, ground, words):
     said, = (said for said in said_by_readings(capture(tmp_path, images, mask=~mask)) if not said.startswith("frames"))
     assert said.startswith("mask:") and words in said
     assert not said_by_readings(capture(tmp_path, images, mask=mask))
+
+
+def test_lights_of_one_colour_are_no_change_of_colours(tmp_path):
+    """Of red lamps, declared so, green and blue readings are noise."""
+    found = capture(tmp_path, noisy(0.5 * SHINING * (1, 0, 0), 1e-3), **{"irradiance_scale": "relative"})
+    frames = [frame.model_copy(update={"light": frame.light.model_copy(update={"irradiance": (1.0, 0.0, 0.0)})})
+              for frame in found.manifest.frames]
+    assert not said_by_readings(replace(found, manifest=found.manifest.model_copy(update={"frames": tuple(frames)})))
 
 
 def test_a_mask_in_alpha_is_said(tmp_path):
