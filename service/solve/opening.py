@@ -25,6 +25,7 @@ from stage.errors import ManifestError
 from stage.motion.tracking import tracking_frames
 from stage.stack.brackets import chosen_frames, merge_brackets, one_frame_a_light
 from stage.stack.ingest import open_stack
+from stage.stack.readings import said_by_readings
 from stage.stack.stack import Stack
 
 if TYPE_CHECKING:
@@ -96,6 +97,9 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
+    if over_time is None:  # else twelve images of each step would be read twice
+        shown = tuple(sentence for sentence in said_by_readings(capture) if sentence not in capture.doubts)
+        capture = replace(capture, doubts=(*capture.doubts, *shown))
     pairs = None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))

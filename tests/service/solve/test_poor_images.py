@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.marks import first_short
-from tests.scenes.captures import Scene, angles_degrees, render, ring, write_capture
+from tests.scenes.captures import Scene, angles_degrees, distant, render, ring, write_capture, write_lit
 
 RNG = np.random.default_rng(41)
 
@@ -38,6 +38,17 @@ def test_a_lamp_in_the_picture(relit, tmp_path, method):
     others = scene.mask.copy()
     others[10, 12] = False
     assert np.median(angles_degrees(maps.normal, scene.normal)[others]) < 0.1
+
+
+def test_readings_that_are_clipped_below_full_scale_are_said(relit, tmp_path):
+    """Twelve bits in files of sixteen, of which a tenth is clipped."""
+    scene = waves(20, 30, 9)
+    images = np.minimum(scene.images / np.quantile(scene.images, 0.9), 1) * 4095 / 65535
+    folder = write_lit(tmp_path, images, [distant(light, 1.0) for light in scene.directions], names="{:03d}.png",
+                       camera={"projection": "orthographic", "resolution": [30, 20]}, irradiance_scale="relative",
+                       color_space="lin_rec709_scene")
+    _, report, _ = relit.solve(folder, "--method", "robust")
+    assert any("4095 of 65535" in sentence for sentence in report["warnings"])
 
 
 @pytest.mark.parametrize("images", ["alike", "mostly dark"])
