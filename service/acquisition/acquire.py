@@ -16,7 +16,7 @@ from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
-from service.acquisition.plans.shots import Shot, shots_of
+from service.acquisition.plans.shots import Shot, refuse_dimming, shots_of
 from service.acquisition.projector import PatternImages, Projector
 from service.acquisition.resuming import change_since, compared_shot, refuse_other_settings, settings_of_files
 from service.errors import RequestError
@@ -24,6 +24,7 @@ from service.play.play import ended_by_signals
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.acquire import AcquireRequest
+from stage.errors import ImageError
 from stage.files import write_text
 from stage.formats import images
 from stage.importers.layout import color_space_of
@@ -84,6 +85,7 @@ class Acquisition:
         self.rig: Rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
         self.plan: Plan = read_plan(request.plan)
         self.shots: tuple[Shot, ...] = shots_of(self.plan, self.rig, request.projector)
+        refuse_dimming(self.shots, self.rig)
         self.patterns: PatternImages = PatternImages(request, self.shots)
         head = {"plan": self.plan.model_dump(mode="json", by_alias=True), "rig": rig_digest(self.rig), "camera": request.camera}
         self.journal = Journal(request.out, head)
@@ -159,12 +161,20 @@ class Acquisition:
                 if shot.grey is not None and shot.key in self.journal.taken}
 
     def _recall(self) -> None:
-        """Take note of the pictures that an earlier run has taken."""
+        """Take note of the pictures that an earlier run has taken; those that are deleted or damaged since are taken again."""
         for shot in [each for each in self.shots if each.key in self.journal.taken]:
             line = self.journal.taken[shot.key]
             path = self._request.out / line["file"]
+            try:
+                pixels = images.read_pixels(path) if path.exists() else None
+            except ImageError:  # as where the power failed
+                pixels = None
+            if pixels is None:
+                self.retaken.append(Fault(shot.key, FaultKind.MISSING, f"{path} is deleted or damaged since it was taken"))
+                self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line), **said(self.retaken[-1:])})
+                continue
             self.faults[shot.key] = [Fault(shot.key, FaultKind(kind), sentence) for kind, sentence in line.get("faults", [])]
-            self.judge.accept(shot, images.read_pixels(path), *self._encoding(path), self.faults[shot.key])
+            self.judge.accept(shot, pixels, *self._encoding(path), self.faults[shot.key])
             self._send(shot, new=False)
 
     def _adopt(self) -> None:

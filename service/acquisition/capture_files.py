@@ -75,8 +75,8 @@ class CaptureFiles:
     def withdraw(self, shot: Shot, line: Mapping[str, Any]) -> dict[str, Any]:
         """Move the picture that a shot has to the rejected ones, and return what the journal says of it."""
         path = self._folder / line["file"]
-        found = self.reject(shot, path, 0)
-        path.unlink()
+        found = self.reject(shot, path, 0) if path.exists() else {}  # else somebody has deleted it
+        path.unlink(missing_ok=True)
         return {**found, "source": line["source"], "was_taken": True}
 
     def write_manifest(self, folder: str, taken: Mapping[str, Mapping[str, Any]], *, mask: str | None = None,
@@ -137,7 +137,10 @@ class Journal:
                 self._read(self._head)
 
     def begin(self, files: Sequence[str]) -> None:
-        """Make the folder, and record what is captured and the files that were there before, where a camera writes files."""
+        """Make the folder, and record what is captured and the files that were there before, where a camera writes files.
+        Raises RequestError if the folder holds a capture without a journal, whose files would be replaced."""
+        if (self._path.parent / FILE_NAME).exists():
+            raise RequestError(f"{self._path.parent}: holds a capture that `relit capture` has not taken: give another folder to --out")
         with storage("write", self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._hold()

@@ -95,10 +95,19 @@ class Controllers(Strict):
                     raise ValueError(f"http.{name}.url is {request.url}: give an address that begins with http:// or https://")
         return self
 
+    def dims(self, protocol: str) -> bool:
+        """Return whether the command that lights a lamp of a protocol, serial or http, says its level."""
+        command = {"serial": self.serial and self.serial.on, "http": self.http and f"{self.http.on.url}{self.http.on.body or ''}"}
+        return "level" in _fields(command.get(protocol) or "")
+
 
 def per_lamp(command: str) -> bool:
     """Return whether a command names a lamp; else it stands for all lamps."""
-    return any(name in ("index", "number", "name") for _, name, _, _ in Formatter().parse(command))
+    return bool(_fields(command) & {"index", "number", "name"})
+
+
+def _fields(command: str) -> set[str | None]:
+    return {name for _, name, _, _ in Formatter().parse(command)}
 
 
 def filled(command: str, index: int, name: str, level: float) -> str:

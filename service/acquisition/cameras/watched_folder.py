@@ -22,7 +22,10 @@ class WatchedFolder(Camera):
     def __init__(self, folder: Path, pattern: str, setup: Setup) -> None:
         if not folder.is_dir():
             raise RequestError(f"--camera watch:{folder}: there is no such folder: give the one into which the tethering program writes")
+        if folder.resolve() == setup.spool.parent.resolve():
+            raise RequestError(f"--camera watch:{folder}: is the folder of --out, whose files would be taken for pictures: give another")
         self._folder, self._pattern, self._setup = folder, pattern, setup
+        self._taken: dict[str, str] = {}  # the name of the file of each picture by the same without its suffix
         self._known = {path.name for path in self._files()} if setup.known is None else set(setup.known)
 
     def present(self) -> list[str]:
@@ -41,6 +44,7 @@ class WatchedFolder(Camera):
                 size = path.stat().st_size
                 if size > 0 and sizes.get(path.name) == size and (pixels := _whole(path)) is not None:
                     self._known.add(path.name)
+                    self._taken[path.stem] = path.name
                     return Picture(path, pixels)
                 sizes[path.name] = size
             time.sleep(POLL_S)
@@ -85,7 +89,14 @@ class WatchedFolder(Camera):
             return [path for _, path in sorted(found)]
 
     def _new(self) -> list[Path]:
-        return [path for path in self._files() if path.name not in self._known]
+        """Return the files that are not known. Raises RequestError if one is a second file of a picture, as raw beside JPEG is, which would
+        be taken for the next picture."""
+        found = [path for path in self._files() if path.name not in self._known]
+        for path in found:
+            if (other := self._taken.get(path.stem)) is not None:
+                raise RequestError(f"--camera watch:{self._folder}: {other} and {path.name} are two files of one picture: let the camera "
+                                   f"write one, or watch one kind, as in watch:{self._folder}/*{path.suffix}, with another --out")
+        return found
 
 
 def _whole(path: Path) -> np.ndarray | None:

@@ -2,7 +2,9 @@
 
 import urllib.error
 import urllib.request
+from http.client import HTTPException
 from pathlib import Path
+from urllib.parse import quote
 
 from service.acquisition.lights.lights import Ask
 from service.acquisition.lights.switched import SwitchedLamps
@@ -11,6 +13,8 @@ from stage.rig.controllers import HttpController, HttpRequest
 from stage.rig.rig import Rig
 
 SEPARATOR = "\0"
+URL_SIGNS = "%/:?#[]@!$&'()*+,;=~"
+"""What stays as it is in an address (RFC 3986, reserved signs and that of codes); others, as in names of lamps, become codes."""
 
 
 class HttpLine:
@@ -22,7 +26,8 @@ class HttpLine:
     def send(self, command: str) -> None:
         """Send a request, given as the text of `written`.
         Raises RequestError if the controller cannot be reached, or its status is not 2xx."""
-        method, url, content_type, *body = command.split(SEPARATOR)
+        method, given, content_type, *body = command.split(SEPARATOR)
+        url = quote(given, safe=URL_SIGNS)
         request = urllib.request.Request(url, method=method, data=body[0].encode() if body else None,
                                          headers={"Content-Type": content_type} if body else {})
         try:
@@ -31,8 +36,8 @@ class HttpLine:
         except urllib.error.HTTPError as error:
             raise RequestError(f"{self._where}: {method} {url} is answered with status {error.code}: check the request and the controller"
                                ) from error
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "reason", error)
+        except (OSError, ValueError, HTTPException) as error:  # the last: it answers otherwise than by HTTP
+            reason = " ".join(str(getattr(error, "reason", error)).split())
             raise RequestError(f"{self._where}: {method} {url}: no answer ({reason}): check the network and the power of the controller"
                                ) from error
 

@@ -118,6 +118,18 @@ def _refuse_some_exposures(shots: Sequence[Shot]) -> None:
                                "its sequences or to none")
 
 
+def refuse_dimming(shots: Sequence[Shot], rig: Rig) -> None:
+    """Refuse shots under parts of the light of lamps that are only switched. Raises RequestError, which names a lamp."""
+    for shot in shots:
+        for (index, _), level in zip(rig.emitters, shot.levels.tolist(), strict=True):
+            address = rig.lights[index].address
+            if 0 < level < 1 and address is not None and not (address.protocol in DMX or rig.controllers.dims(address.protocol)):
+                advice = "" if address.protocol == "manual" else f" (controllers.{address.protocol}.on has no field {{level}})"
+                raise RequestError(f"the plan has {rig.lights[index].name} at {100 * level:.2g} % of its light for {shot.key}, and its "
+                                   f"protocol {address.protocol} only switches{advice}: gradients and a level below 1 need lamps that are "
+                                   "dimmed")
+
+
 def _sequence(sequence: AnySequence, rig: Rig, projector: tuple[int, int] | None, where: str) -> Iterator[Shot]:
     """Yield the shots of a sequence, once for all exposures, without their numbers."""
     dark, full = np.zeros(len(rig.emitters)), even_levels(rig)
