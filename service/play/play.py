@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain, repeat
 from typing import NamedTuple
 
 from service.errors import RequestError
@@ -18,6 +19,9 @@ READY_S = 0.01
 """A frame is prepared so long before its time."""
 KEEP_ALIVE_S = 0.8
 """The longest silence; E1.31-2018, section 6.6.2, asks for a packet between 800 and 1000 ms after the last one."""
+REPEATS, REPEAT_S = 2, 0.025
+"""How often values that stay are sent again before silences, as packets may be lost (the same section asks for three packets), and the time
+between: DMX has 44 refreshes a second."""
 BLACKOUTS, BLACKOUT_PAUSE_S = 3, 0.02
 """The dark frames at the end, because any packet may be lost, and the time between them."""
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -95,14 +99,15 @@ def _run(show: Show, outputs: dict[str, Output], stopping: threading.Event) -> P
 def _wait(until: float, outputs: dict[str, Output], stopping: threading.Event) -> bool:
     """Wait for a moment of the monotonic clock, and return True if the show is stopped before.
 
-    Every KEEP_ALIVE_S the last frame is sent again, because fixtures take a silent source for lost.
+    The last frame is sent again REPEATS times if it stays, then every KEEP_ALIVE_S, because fixtures take a silent source for lost.
     """
-    while not stopping.wait(min(max(0.0, until - time.monotonic()), KEEP_ALIVE_S)):
-        if time.monotonic() >= until:
-            return False
+    pauses = chain(repeat(REPEAT_S, REPEATS), repeat(KEEP_ALIVE_S))
+    while (left := max(0.0, until - time.monotonic())) > 2 * REPEAT_S and (pause := next(pauses)) < left:  # not just before the next frame
+        if stopping.wait(pause):
+            return True
         for output in outputs.values():
             output.send()
-    return True
+    return stopping.wait(left)
 
 
 def send(outputs: dict[str, Output], values: Values) -> None:

@@ -18,7 +18,7 @@ ALIKE, UNEQUAL = 0.02, 0.1
 """Pictures under different lamps are of none of them if their light differs by less than the first part, and their shading by LEAST_MISFIT;
 not where a flat card would look so, under lamps whose heights above it differ by less than the second."""
 
-ADVICE = "are the lamps switched on, and does what is sent reach them?"
+ADVICE = "are the lamps switched on, does what is sent reach them, and does nothing else drive them?"
 
 
 def unreached_faults(pictures: Sequence[Seen], directions: np.ndarray, dark_of: Callable[[Shot], np.ndarray | float]) -> list[Fault]:

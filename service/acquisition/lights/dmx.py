@@ -8,7 +8,7 @@ import numpy as np
 from service.acquisition.lights.lights import Ask
 from service.errors import RequestError
 from service.play.outputs import Output, open_output
-from service.play.play import KEEP_ALIVE_S, black_out, send
+from service.play.play import KEEP_ALIVE_S, REPEAT_S, REPEATS, black_out, send
 from service.play.show import Values, dark_values, driven_universes, hosts_of
 from service.requests.play import PlayRequest
 from stage.rig.patch import drive_steps, universe_values
@@ -16,7 +16,8 @@ from stage.rig.rig import Rig
 
 
 class DmxSwitch:
-    """Sends the universes of a rig, and sends them again while they stay as they are, because fixtures take a silent source for lost."""
+    """Sends the universes of a rig, and sends them again while they stay as they are: packets may be lost, and fixtures take a silent
+    source for lost."""
 
     def __init__(self, path: Path, rig: Rig) -> None:
         request = PlayRequest(cues=path, rig=path)
@@ -24,7 +25,7 @@ class DmxSwitch:
         self._rig = rig
         self._outputs: dict[str, Output] = {protocol: open_output(protocol, found, request) for protocol, found in hosts.items()}
         self._dark = dark_values(hosts)
-        self._lock, self._closing = threading.Lock(), threading.Event()
+        self._lock, self._changed, self._closing = threading.Lock(), threading.Event(), False
         self._refused: RequestError | None = None
         self._thread = threading.Thread(target=self._keep_alive, name="relit-dmx", daemon=True)
         self._thread.start()
@@ -38,15 +39,23 @@ class DmxSwitch:
             raise self._refused
         with self._lock:
             send(self._outputs, values)
+        self._changed.set()
 
     def close(self) -> None:
         """Send dark frames, and end the streams."""
-        self._closing.set()
+        self._closing = True
+        self._changed.set()
         self._thread.join()
         black_out(self._outputs, self._dark)
 
     def _keep_alive(self) -> None:
-        while not self._closing.wait(KEEP_ALIVE_S):
+        left = 0
+        while not self._closing:
+            if self._changed.wait(REPEAT_S if left else KEEP_ALIVE_S):
+                self._changed.clear()
+                left = REPEATS
+                continue
+            left = max(0, left - 1)
             try:
                 with self._lock:
                     for output in self._outputs.values():

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire, refuse_to_ask
+from service.acquisition.lights.dmx import DmxSwitch
 from service.errors import RequestError
-from tests.scenes.captures import write_image
-from tests.scenes.patched_rigs import write_plan
+from service.play.play import BLACKOUTS
+from service.twin.listener import Listener
+from stage.rig.rig import read_rig
+from tests.scenes.captures import ring, write_image
+from tests.scenes.patched_rigs import loopback, write_plan, write_rig_file
 from tests.service.acquisition.test_acquire import by_hand, check, controller, request, stage, write_rig  # noqa: F401 (a fixture)
 from tests.service.answering import Asked, answering
 
@@ -102,3 +106,21 @@ def test_a_controller_that_answers_otherwise_than_by_http_is_one_sentence(tmp_pa
         with pytest.raises(RequestError, match=r"controllers\.http: .*no answer") as error:
             acquire(request(tmp_path, stage, rig), refuse_to_ask)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("protocol", ["sacn", "artnet"])
+def test_the_levels_of_dmx_are_sent_three_times(tmp_path, protocol):
+    """E1.31-2018, section 6.6.2; a lost packet left the lamp of the picture before on for up to 0.8 s."""
+    host = loopback()
+    path = write_rig_file(tmp_path / "rig.json", ring(2), host=host, protocol=protocol)
+    rig = read_rig(path)
+    with Listener([(protocol, 1)], host, keep=True) as listener:
+        switch = DmxSwitch(path, rig)
+        try:
+            switch.set(np.ones(len(rig.emitters)))
+            threading.Event().wait(0.4)  # less than the 0.8 s of the packets that keep a source alive
+            sent = len(listener.kept)
+        finally:
+            switch.close()
+    assert sent == 3 and all(frame.values[protocol, 1][0] == 255 for frame in listener.kept[:sent])
+    assert not listener.kept[-1].values[protocol, 1].any() and len(listener.kept) == sent + BLACKOUTS

@@ -148,7 +148,14 @@ def test_a_slow_show_keeps_its_source_alive(tmp_path, monkeypatch, protocol):
     monkeypatch.setattr(module, "KEEP_ALIVE_S", 0.1)
     found = played(tmp_path, counted_steps(2, 12), 4, 2, protocol, frames_per_second=2)
     values = [round(255 * float(levels[0])) for levels in found]
-    assert values == sorted(values[:-3]) + [0, 0, 0] and all(3 <= values.count(step) <= 5 for step in (1, 2))
+    assert values == sorted(values[:-3]) + [0, 0, 0] and all(5 <= values.count(step) <= 7 for step in (1, 2))
+
+
+@first_short("protocol", ["sacn", "artnet"])
+def test_values_that_stay_are_sent_three_times(tmp_path, protocol):
+    """E1.31-2018, section 6.6.2."""
+    found = played(tmp_path, counted_steps(2, 12), 4, 2, protocol, frames_per_second=4)
+    assert [round(255 * float(levels[0])) for levels in found][3:] == [1, 1, 1, 2, 2, 2, 0, 0, 0]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
