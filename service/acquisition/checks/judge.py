@@ -10,7 +10,6 @@ import numpy as np
 
 from service.acquisition.checks.expectation import (
     LEAST_LAMPS,
-    LEAST_MISFIT,
     SHADE_PART,
     Expectation,
     Fault,
@@ -27,6 +26,7 @@ from service.acquisition.checks.expectation import (
 from service.acquisition.checks.motion import Bands, bands_of, motion_between, shift_between
 from service.acquisition.checks.picture_sample import place_of_tile, sample_of
 from service.acquisition.checks.unreached import glows, shows, unreached_faults
+from service.acquisition.checks.wrong_lamps import exchanged_faults, twin_of
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig
 
@@ -40,13 +40,6 @@ LEAST_LIGHT = 0.05
 """A lamp is judged if it gives, or should give, this part of the light that lamps give on the average."""
 UNLIT_PART = 0.03
 """A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
-SAME_PART = 0.15
-"""Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
-NEIGHBOURS, NEIGHBOUR_WEIGHT = 8, 4.0
-"""The neighbours of either lamp whose predictions tell which of them shone, and how much the logarithm of what they misfit counts: their
-pictures are right, and there are several."""
-NEAR_COSINE = 0.3
-"""Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
 BRIGHT_GAIN = 2.0
 """A picture is too bright if it has more than this factor of the light of its prediction and of every picture that this rests on."""
 LEAST_BRIGHT_WEIGHT, BRIGHT_CLIPPED_SHARE = 0.05, 0.001
@@ -133,6 +126,8 @@ class Judge:
         found: dict[str, Fault] = {}
         left = [each for key, each in self._seen.items() if key not in certain]
         certain |= {fault.shot: fault for fault in unreached_faults(left, self._expectation.directions, self._dark)}
+        sound = [each for each in left if each.shot.key not in certain and each.shot.lamp not in self._held]
+        certain |= {fault.shot: fault for fault in exchanged_faults(sound, self._expectation)}
         keys = [key for key in self._seen if key not in certain]
         for key in keys:
             if faults := self._dark_faults(self._seen[key], [self._seen[other] for other in keys if other not in found]):
@@ -220,7 +215,7 @@ class Judge:
         if light < UNLIT_PART * should:
             return [Fault(shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / should):.2g} % of the light that the others predict")]
         held = shot.lamp in self._held  # by a person, so that it stands about where the rig says: shading tells no more than that it is on
-        if shot.lamp is not None and not held and (twin := self._twin(seen, others)) is not None:
+        if shot.lamp is not None and not held and (twin := twin_of(seen, others, self._expectation)) is not None:
             return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
         if shot.lamp is not None and (bright := self._bright_fault(seen, used, usual, dark, max(should, least))) is not None:
             return [bright]
@@ -282,30 +277,6 @@ class Judge:
                 stay.append(_moved(each, expected_bands(weights), usual) is None)
         return 2 * sum(stay) >= len(stay)
 
-    def _twin(self, seen: Seen, others: list[Seen]) -> str | None:
-        """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.
-
-        Three things tell which of both lamps shone: what the others predict of either, what the picture at either place predicts of its
-        neighbours, and that pictures differ the more, the farther apart their lamps are.
-        """
-        others = [each for each in others if each.shot.lamp != seen.shot.lamp]  # a plan may light a lamp more than once
-        if len(others) < LEAST_LAMPS:
-            return None
-        differ = 1 - np.array([each.root for each in others]) @ seen.root
-        order = np.argsort(differ)
-        if differ[order[0]] > SAME_PART * differ[order[2]]:
-            return None
-        both, rest = (seen, others[order[0]]), [others[index] for index in order[1:]]
-        cosines = self._expectation.towards(rest) @ self._expectation.towards(list(both)).T
-        near = [rest[index] for index in np.argsort(-cosines.max(axis=1))[:NEIGHBOURS]]
-        around = np.array([[self._expectation.misfit(one, [*(other for other in rest if other is not one), each]) for each in both]
-                           for one in near])
-        around = around[(around > 0).all(axis=1)].sum(axis=0)  # a misfit of 0: nothing was expected
-        misfits = [self._expectation.misfit(each, rest) for each in both]
-        worse = [np.log(max(misfit, LEAST_MISFIT)) + NEIGHBOUR_WEIGHT * np.log(max(beside, LEAST_MISFIT))
-                 - _agreement(differ[order[1:]], column) for misfit, beside, column in zip(misfits, around, cosines.T, strict=True)]
-        return both[1].shot.key if worse[0] > worse[1] else None
-
     def _sound(self) -> list[str]:
         return [key for key, each in self._seen.items() if not each.faults]
 
@@ -327,14 +298,6 @@ class Judge:
                 if not each.faults and _is_dark(each.shot) and comparable(each.shot, shot)]
         found: np.ndarray | float = np.mean(dark, axis=0) if dark else 0.0
         return found
-
-
-def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
-    """Return the correlation of pictures' differences with the angles to their lamps, of those that are near."""
-    near = cosines > NEAR_COSINE
-    if near.sum() < 3:
-        return -1.0
-    return float(np.corrcoef(differences[near], np.arccos(np.minimum(cosines[near], 1)))[0, 1])
 
 
 def _is_dark(shot: Shot) -> bool:

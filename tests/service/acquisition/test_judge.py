@@ -41,6 +41,23 @@ def test_each_fault_is_named_over_random_seeds(scene, seeds):
         assert found == made, seed
 
 
+@pytest.mark.parametrize("exchanged", [(), (6, 29), (15, 11)])
+def test_exchanged_lamps_are_named_as_such_and_none_else(exchanged):
+    """They were taken for light of the room, or not seen."""
+    scene = relief(1)
+    rig = rig_of(scene)
+    shots, judge, camera = shots_on(rig), Judge(rig), NoisyCamera(scene, 1)
+    of_lamp = {shot.lamp: shot for shot in shots}
+    for shot in shots:
+        shone = exchanged[1 - exchanged.index(shot.lamp)] if shot.lamp in exchanged else shot.lamp
+        judge.accept(shot, camera.take(shot if shone is None else of_lamp[shone]), "lin_rec709_scene", FULL_SCALE)
+    found = {fault.shot: fault for fault in judge.review()}
+    assert found.keys() == {of_lamp[lamp].key for lamp in exchanged}
+    for lamp, other in zip(exchanged, exchanged[::-1], strict=True):
+        fault = found[of_lamp[lamp].key]
+        assert fault.kind is FaultKind.WRONG_LIGHT and of_lamp[other].key in fault.sentence and "exchanged" in fault.sentence
+
+
 @pytest.mark.long
 def test_lamps_of_unequal_light_are_judged_by_what_the_rig_says_of_it():
     """Unsaid, one of them looks like ambient light."""
