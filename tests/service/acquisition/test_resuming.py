@@ -22,7 +22,7 @@ from stage.results.maps import SurfaceMaps
 from stage.stack.early import EarlyStack
 from stage.stack.ingest import Ingest
 from tests.marks import first_short
-from tests.scenes.captures import angles_degrees, make_scene, render, write_capture, write_image
+from tests.scenes.captures import angles_degrees, edit_manifest, make_scene, render, write_capture, write_image
 from tests.scenes.patched_rigs import write_plan
 from tests.service.acquisition.test_acquire import LAMPS, Stage, by_hand, check, controller, request
 from tests.service.full_disk import files_of_at_most
@@ -203,6 +203,20 @@ def test_an_exposure_that_changes_on_the_way_is_said_with_the_preview(tmp_path):
     images_taken = scene.images * np.where(np.arange(16) % 2, 1, 0.5)[:, None, None, None]
     (warning,) = write_preview(write_capture(tmp_path / "capture", scene._replace(images=images_taken)), "cpu").warnings
     assert warning.startswith("frames[].light.irradiance: it is missing or wrong") and "exposure" in warning
+
+
+@pytest.mark.long
+def test_lights_that_are_wrong_are_said_though_most_of_the_picture_is_black(tmp_path):
+    """The noise of a black background, an eighth of which is object, hid whatever the object says."""
+    scene, random = make_scene(size=64, lights=16), np.random.default_rng(1)
+    for name, other, said in (("right", 1.0, None), ("wrong", 0.5, "frames[].light.irradiance")):
+        images_taken = scene.images * np.where(np.arange(16) % 2, 1, other)[:, None, None, None]
+        dark = np.pad(images_taken, ((0, 0), (64, 64), (64, 64), (0, 0)))
+        noisy = dark + 0.01 * dark.max() * random.standard_normal(dark.shape)
+        folder = write_capture(tmp_path / name, scene._replace(images=noisy))
+        edit_manifest(folder, mask=None, camera=lambda camera: camera | {"resolution": [192, 192]})
+        warnings = write_preview(folder, "cpu").warnings
+        assert (warnings == ()) if said is None else warnings[0].startswith(said)
 
 
 def arguments(folder, stage, rig) -> list:
