@@ -64,7 +64,7 @@ def check_rig(request: RigCheckRequest) -> RigCheck:
 
 
 def _places(rig: Rig) -> list[str]:
-    """Say which lamps with the same primaries stand in one direction, and that all stand too far or too near to be lamps."""
+    """Say which lamps with the same primaries stand in one direction, and that all stand behind, too far or too near to be lamps."""
     said = []
     directions, subject = rig.directions, np.array(rig.subject_m)
     near = np.arccos(np.clip(directions @ directions.T, -1, 1)) < np.radians(ONE_PLACE_DEGREES)
@@ -74,6 +74,8 @@ def _places(rig: Rig) -> list[str]:
         one, other = pairs[0]
         said.append(f"lights: {rig.lights[one].name} and {rig.lights[other].name} stand in one direction"
                     + (f", and {len(pairs) - 1} more pairs" if len(pairs) > 1 else "") + ": a place that was copied?")
+    if (directions[:, 2] < 0).all():
+        said.append("lights: all lamps stand behind the subject, which the camera sees unlit: does z point towards the viewer?")
     places = [lamp.position_m for lamp in rig.lights if lamp.position_m is not None]
     distance = float(np.median(np.linalg.norm(np.array(places) - subject, axis=1))) if places else None
     if distance is not None and not NEAREST_M <= distance <= FARTHEST_M:

@@ -18,6 +18,7 @@ from stage.capture.point_lights import place_lights
 from stage.colour.colour_spaces import linear_space
 from stage.errors import ManifestError
 from stage.formats.csv_table import read_table
+from stage.importers.light_table import check_angles
 from stage.model import Strict
 from stage.records import describe
 from stage.rig.rig import CHANNELS, RIG_SCHEMA, UNIVERSES, Address, Lamp, Primary, Rig, write_rig
@@ -76,7 +77,7 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
         raise ManifestError(f"{request.table}: has one of the columns universe and channel: give both or neither")
     patched = "universe" in heads
     patch = repeat(None) if patched else addresses(request, request.primaries)
-    lamps = []
+    lamps, places = [], []
     for row, address in zip(rows, patch, strict=False):
         where = f"{request.table}: line {rows.line_num}"
 
@@ -89,9 +90,12 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
         place = number("x"), number("y"), number("z")
         strength = number("irradiance") if "irradiance" in heads else request.irradiance
         if patched:
-            channel = int(number("channel"))
+            universe, channel = number("universe"), number("channel")
+            if int(universe) != universe or int(channel) != channel:
+                raise ManifestError(f"{where}: universe and channel are {row['universe']} and {row['channel']}: give whole numbers")
+            channel = int(channel)
             given = {name: channel + index * request.bits // 8 for index, name in enumerate(request.primaries)}
-            entry: object = {"protocol": request.protocol.value, "universe": int(number("universe")), "channels": given,
+            entry: object = {"protocol": request.protocol.value, "universe": int(universe), "channels": given,
                              "host": request.host}
         else:
             entry = address
@@ -99,6 +103,8 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
                 "position_m" if request.places else "direction": place,
                 "primaries": [{"name": name, "irradiance": tuple(strength * part for part in COLOURS[name])} for name in request.primaries]}
         lamps.append(checked(Lamp, data, where))
+        places.append(place)
+    check_angles(np.array(places).reshape(-1, 3), str(request.table))
     rig = checked(Rig, {"schema": RIG_SCHEMA, "name": request.table.stem, "lights": tuple(lamps)}, str(request.table))
     write_rig(rig, request.out)
     return rig

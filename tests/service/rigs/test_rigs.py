@@ -61,6 +61,8 @@ def test_a_rig_is_made_of_a_table(relit, tmp_path):
     ("name,x,y,z,channel\nA,0,0,1,3\n", "universe"),
     ("name,x,y,z\nA,0,0,1\nA,0,1,1\n", "lights[1].name"),
     ("name,x,y,z\n", "lights"),
+    ("name,x,y,z,universe,channel\nA,0,0,1,1.5,3\n", "line 2: universe"),
+    ("name,x,y,z\nA,0,60,1.2\nB,120,45,1.2\nC,-120,60,1.2\nD,170,10,1.2\n", "two angles"),
     ("name,x,y,z\nA,0,0,1\nB,0,6,0,0,8\n", "line 3: has 6 cells, the first line names 4 columns"),
 ])
 def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
@@ -83,6 +85,10 @@ def test_lamps_of_one_place_and_places_in_millimetres_are_said(relit, tmp_path):
     relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json", "--places")
     shown = relit.done("rig", "check", tmp_path / "rig.json").out
     assert "B and C stand in one direction" in shown and "lights[].position_m: the lamps stand 1.5e+03 m" in shown
+    assert "lights: all lamps stand behind" not in shown
+    (tmp_path / "dome.csv").write_text("name,x,y,z\nA,0,0,-1\nB,0.6,0,-0.8\n")
+    relit.done("rig", "from-csv", tmp_path / "dome.csv", "--out", tmp_path / "rig.json")
+    assert "lights: all lamps stand behind" in relit.done("rig", "check", tmp_path / "rig.json").out
 
 
 @pytest.mark.parametrize(("unit", "said"), [(1, True), (1000, False)], ids=["metres", "millimetres"])
