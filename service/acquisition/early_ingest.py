@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from kernels.status import ESTIMATED
-from service.acquisition.meter import OBJECT_PART, SHARE
 from service.acquisition.plans.shots import Shot
 from service.light_estimation.declared_lights import declared_light_sentences
+from service.light_estimation.lit_object import lit_object
 from service.relight.relight import relight
 from service.relight.sheet import AS_EVER, BACKGROUND, display, exposure_of, fit, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
@@ -32,9 +31,6 @@ from stage.stack.early import EarlyStack
 from stage.stack.ingest import CACHE_FOLDER, Ingest
 
 PREVIEW_FILE = "preview.png"
-RIM = 0.02
-"""What is looked at around the object, as a part of the longer side: by the very outline, at which velvet is bright, 8 of 13 right
-captures of it seemed to have turned lights."""
 ROWS = 480
 """Pixels of the height of each picture, at most."""
 KEY_LIGHT = {"name": "key", "keys": [{"frame": 1, "direction": [-0.5, 0.6, 0.62], "irradiance": [3, 3, 3], "angle_degrees": 20}]}
@@ -98,15 +94,6 @@ class EarlyIngest:
                         self._early.add(capture, frame, light)
             except (StageError, MemoryError):  # no more is decoded before all are there; `finish` says what is wrong if it still is
                 self._stopped = True
-
-
-def lit_object(
-    albedo: np.ndarray,  # [rows, cols], 0 where it is not known
-) -> np.ndarray:
-    """Return where an image shows the object and no dark background, whose noise hides what is wrong with lights, [rows, cols] bool:
-    single pixels of noise are none, dark parts within it are of it, and so is RIM around it."""
-    lit = ndimage.binary_fill_holes(ndimage.binary_opening(albedo > OBJECT_PART * np.quantile(albedo, 1 - SHARE)))
-    return np.asarray(ndimage.binary_dilation(lit, iterations=max(1, round(RIM * max(lit.shape)))))
 
 
 class Preview(NamedTuple):

@@ -18,6 +18,7 @@ from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import Shot, shots_of
 from service.errors import RequestError
+from service.light_estimation.lit_object import OBJECT_PART
 from service.relight.sheet import AS_EVER, BACKGROUND, TILE, display, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.acquire import AcquireRequest
@@ -34,8 +35,6 @@ SHARE = 1e-3
 """The share of the object that the brightest lamp may clip."""
 TARGET = 0.9
 """The part of full scale at which the brightest reading of the rest is put: noise adds some."""
-OBJECT_PART = 0.05
-"""Pixels that read more than this part of the brightest under one of the lamps are of the object."""
 STEP = 2 ** (1 / 3)
 """The steps of exposure times, thirds of a stop, as cameras have them."""
 ROUNDED = 1.1

@@ -120,7 +120,7 @@ def _numbers(values: np.ndarray, run: Run | None, what: str) -> LightTable:
 
 def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
     """Refuse a light without a direction, which `place` names, and angles."""
-    _check_angles(table.vectors, table.what)
+    check_angles(table.vectors, table.what)
     for index, vector in enumerate(table.vectors):
         if not np.isfinite(vector).all() or not vector.any():
             raise ManifestError(f"{place(index)}: {' '.join(f'{value:g}' for value in vector)} is no direction and no position")
@@ -240,12 +240,14 @@ def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[in
     return rows
 
 
-def _check_angles(vectors: np.ndarray, what: str) -> None:
+def check_angles(vectors: np.ndarray, what: str) -> None:
     """Refuse two angles, in degrees or radians, beside a radius, as vectors [lights, 3]. `what`: the file, for the message."""
+    if len(vectors) < 4:
+        return
     for radius, angles in ((0, (1, 2)), (0, (2, 1)), (2, (0, 1)), (2, (1, 0))):
         length, given = vectors[:, radius], vectors[:, angles]
         turn, height = np.abs(given).T
-        told = len(length) > 3 and np.ptp(length) == 0 < np.ptp(height)
+        told = np.ptp(length) == 0 < np.ptp(height)
         degrees = 90 < turn.max() <= 360 and height.max() <= 90 and (
             length[0] < FLAT * float(np.median(np.hypot(turn, height))) or (given.min() >= 0 and turn.max() > HALF_TURN))
         radians = np.ptp(given[:, 0]) > 0.75 * ROUND and turn.max() <= ROUND and given[:, 1].min() >= 0 and height.max() <= QUARTER

@@ -4,6 +4,7 @@ A wrong manifest seldom stops a solver: it finds normals that are wrong everywhe
 sentence that names the field, and raises the standard error of every normal by the angle that the finding asks for.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from service.light_estimation.declared_lights import explanation_sentence, sampl
 from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest
 from service.light_estimation.lambertian import degrees_between
 from service.light_estimation.light_axes import LightAxes
+from service.light_estimation.lit_object import lit_object
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, at_all_pixels, raise_error, suspect_lights
 from service.solve.lights.adapted import find_adapted
 from service.solve.lights.intensities import LEAST_GAIN as LEAST_ASKED
@@ -27,6 +29,8 @@ from stage.capture.lighting import ExtendedLights
 from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.colour.colour_spaces import is_linear
 
+FILLS = 0.9
+"""Part of an image above which an object fills it, and no dark background hides from the sample what is wrong."""
 UNORDERED = (Cause.REVERSED, Cause.TEXT, Cause.SHIFTED, Cause.BALL_NORMALS, Cause.ELEVATION, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
 REPAIRED = "; the solve has used the brightness that the images ask for (found.light_intensities)"
@@ -42,6 +46,9 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     manifest, which may have other intensities. `other`: lights that explain the images much better. `rig`: they as the solve has taken
     them."""
     field = FIELDS.get(type(lights), "the capture of the reference ball")
+    if given.mask.all():
+        seen = lit_object(solution.albedo.astype(np.float32).mean(axis=0).reshape(given.mask.shape))
+        given = replace(given, mask=seen) if seen.mean() < FILLS else given
     fit = None
     if isinstance(lights, DistantLights):
         assert isinstance(declared, DistantLights)

@@ -11,8 +11,9 @@ from scipy import ndimage
 
 from service.acquisition.acquire import acquire, refuse_to_ask
 from service.acquisition.checks.judge import FULL_SCALE
-from service.acquisition.meter import OBJECT_PART, SHARE, TARGET, meter
+from service.acquisition.meter import SHARE, TARGET, meter
 from service.errors import RequestError
+from service.light_estimation.lit_object import OBJECT_PART
 from service.requests.acquire import AcquireRequest
 from stage.formats import images
 from tests.reference.colour import srgb_to_linear

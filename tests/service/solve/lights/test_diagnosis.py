@@ -73,6 +73,20 @@ def test_wrong_axes_are_named_and_doubted(tmp_path, matrix, words):
     assert not result.maps.estimated.any() or confidence(result) < UNSURE
 
 
+@pytest.mark.parametrize(("scene", "words"), [
+    (SCENE, None),
+    (SCENE._replace(directions=np.roll(SCENE.directions, 1, 0), irradiance=np.roll(SCENE.irradiance, 1, 0)), "one frame off"),
+], ids=["right", "one frame off"])
+def test_a_dark_background_without_a_mask_hides_no_wrong_order(tmp_path, scene, words):
+    """The object takes a seventh of the image; the rest is the noise of a camera."""
+    wide = [(0, 0), *[(side, side) for side in scene.mask.shape], (0, 0)]
+    images = np.pad(scene.images * scene.mask[..., None], wide)
+    noise = np.random.default_rng(5).normal(0, 1e-3 * scene.images.max(), images.shape)
+    shown = scene._replace(images=np.maximum(images + noise, 0), mask=np.ones(images.shape[1:3], bool))
+    said = alarms(solved(tmp_path, shown, mask=None))
+    assert said == [] if words is None else words in " ".join(said)
+
+
 def test_the_standard_error_of_mirrored_normals_is_the_error_that_they_have(tmp_path):
     result = solved(tmp_path, lit_from(np.diag([1, -1, 1])))
     mask = result.maps.estimated
