@@ -26,7 +26,7 @@ from service.requests.solve import Method, SolveRequest
 from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from service.solve.height import interreflection
-from service.solve.methods import settling
+from service.solve.methods import bounce_evidence
 from service.solve.solve import solve
 from stage.formats import exr
 from tests import emulated_device
@@ -223,7 +223,7 @@ class Row(NamedTuple):
 
 def run(way: str, folder: Path, out: Path, device: str, progress: Counting) -> None:
     """Run a way on a device, with as many patches and blocks at both sizes: at the sizes of captures their number is bounded."""
-    with patch.object(interreflection, "PATCHES", PATCHES), patch.object(settling, "BLOCKS", PATCHES):
+    with patch.object(interreflection, "PATCHES", PATCHES), patch.object(bounce_evidence, "BLOCKS", PATCHES):
         WAYS[way].run(folder, out, device, progress)
 
 

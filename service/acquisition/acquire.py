@@ -162,8 +162,7 @@ class Acquisition:
 
     def _recall(self) -> None:
         """Take note of the pictures that an earlier run has taken; those that are deleted or damaged since are taken again."""
-        for shot in [each for each in self.shots if each.key in self.journal.taken]:
-            line = self.journal.taken[shot.key]
+        for shot, line in [(each, self.journal.taken[each.key]) for each in self.shots if each.key in self.journal.taken]:
             path = self._request.out / line["file"]
             try:
                 pixels = images.read_pixels(path) if path.exists() else None

@@ -242,9 +242,7 @@ def _without_numbers(path: Path, headings: list[str] | None, rows: list[tuple[in
 
 def check_angles(vectors: np.ndarray, what: str) -> None:
     """Refuse two angles, in degrees or radians, beside a radius, as vectors [lights, 3]. `what`: the file, for the message."""
-    if len(vectors) < 4:
-        return
-    for radius, angles in ((0, (1, 2)), (0, (2, 1)), (2, (0, 1)), (2, (1, 0))):
+    for radius, angles in ((0, (1, 2)), (0, (2, 1)), (2, (0, 1)), (2, (1, 0))) if len(vectors) > 3 else ():
         length, given = vectors[:, radius], vectors[:, angles]
         turn, height = np.abs(given).T
         told = np.ptp(length) == 0 < np.ptp(height)
