@@ -125,6 +125,7 @@ def _fit(readings: _Readings, over: np.ndarray) -> _Fits:
     columns = np.concatenate([readings.toward, over[:, None]], axis=1)
     gram = np.einsum("ln,li,lj->nij", readings.lit.astype(np.float64), columns, columns)
     told = (readings.lit.sum(axis=0) >= LEAST_READINGS) & (np.linalg.cond(gram) < MOST_CONDITION)
+    told &= (readings.lit & (readings.value > 0)).any(axis=0)
     value, weight, gram = readings.value[:, told], readings.lit[:, told].astype(np.float64), gram[told]
     sums = np.einsum("ln,li->ni", weight * value, columns)
     inverse = np.linalg.inv(gram)

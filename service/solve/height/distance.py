@@ -294,8 +294,8 @@ def fit_near(readings: np.ndarray, usable: np.ndarray, lamps: Lamps, points: np.
         irradiance *= np.maximum(-(direction * lamps.lobe[:, :3]).sum(axis=2), 0) ** lamps.lobe[:, 3]
     # one factor a pixel: only the ratios of the lights count
     lit_by = direction * (irradiance / np.maximum(irradiance.mean(axis=1, keepdims=True), 1e-300))[..., None]
-    bright = np.maximum(bright_readings(readings, usable), 1e-300)
-    relative = readings / bright
+    bright = np.broadcast_to(bright_readings(readings, usable), readings.shape)
+    relative = np.divide(readings, bright, out=np.zeros_like(readings), where=bright > 0)
     lit = usable & (relative > SHADOW)
     weight = lit.astype(np.float64)
     for _ in range(FIT_ROUNDS):
