@@ -1,12 +1,11 @@
 """What the readings of the frames under lights show of a capture that its manifest does not say: a level below full scale at which they are
-clipped, colours that change from frame to frame, and a mask of all but the object.
+clipped, and a mask of all but the object.
 
-Each is told by what a right capture does not show: shading has no level that many readings share and none exceeds; the colours of a pixel
-keep their ratios under all lights but for gloss, which spares most pixels; and a mask that reaches all around the image and leaves out what
-lies within is of an object where that is bright, or has a shape.
+Each is told by what a right capture does not show: shading has no level that many readings share and none exceeds, and a mask that reaches
+all around the image and leaves out what lies within is of an object where that is bright, or has a shape.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,14 +29,6 @@ FEWEST_CLIPPED, UNLIKE = 20, 1.1
 """Fewest readings of all frames that are called clipped, and ratio of their numbers in two frames: a facet has one size in all."""
 EIGHT_BITS = 255
 """The largest integer of eight bits."""
-LIT, FEWEST_LIT, MOST_LIT = 0.1, 50, 0.5
-"""Least part of the brightest readings of a frame of those whose colour is looked at, fewest of a frame, and least part of them all: a
-highlight of one side of a thing leaves the others darker than that."""
-COLOURS, MANY = 0.04, 0.3
-"""Least change of a ratio of channels that is said, which moves grey by a hundredth, and part of the frames in which it is as large."""
-PART, ALIKE, CURVED, SEVERAL = 0.8, 0.5, 0.25, 0.15
-"""Part of the pixels in which the change is alike, largest difference there, relative to it, and least residual of one normal or else least
-difference of the logarithms of ratios: the gloss of a plane of one colour changes it alike, that of what is curved or painted does not."""
 AROUND, WITHIN, LEFT_OUT = 0.9, 0.5, 0.1
 """Least part of the pixels at the border of an image that a mask of the rest has, least part of what it leaves out that is away from the
 border, and least part of the image that it leaves out."""
@@ -87,9 +78,8 @@ def said_by_readings(capture: Capture) -> list[str]:
         return Seen(full, float(values[-1]) / (full or 1), int(counts[-1]), int(near.max(initial=0)), len(near),
                     *(at.corrected(flat[places][:, None], frame)[:, 0] / strength for places, at in some))
 
-    frames = {lit[index][0].image: see(*lit[index]) for index in _evenly(np.arange(len(lit)), MOST_FRAMES)}
-    seen = list(frames.values())
-    return [*_clipped(capture.manifest.saturation, seen), *_other_colours(frames), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
+    seen = [see(*lit[index]) for index in _evenly(np.arange(len(lit)), MOST_FRAMES)]
+    return [*_clipped(capture.manifest.saturation, seen), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
 
 
 def _evenly(places: np.ndarray, count: int) -> np.ndarray:
@@ -111,36 +101,6 @@ def _clipped(saturation: float | None, frames: Sequence[Seen]) -> list[str]:
     told = f"{top:.4g}" + (f" ({round(top * full)} of {full})" if full else "")
     return [f"saturation: many readings of {len(at)} images are {told}, and none is above: they are clipped there, and are taken for light "
             f"that was measured: give saturation {np.floor(top * 1e5) / 1e5:.5g}"]
-
-
-def _other_colours(frames: Mapping[str, Seen]) -> list[str]:
-    """Return the sentence for channels whose ratios change from frame to frame, alike in nearly all pixels."""
-    readings = np.stack([each.inside for each in frames.values()])
-    grey = readings @ np.array(GREY_WEIGHTS)
-    lit = readings.min(axis=2) > LIT * np.percentile(grey, 99, axis=1, keepdims=True)
-    kept = lit.sum(axis=0) >= FEWEST_FRAMES
-    if kept.sum() < FEWEST_LIT:
-        return []
-    lit = lit[:, kept]
-    logs = np.log(np.where(lit[..., None], readings[:, kept], np.nan))
-    ratios = logs[..., [0, 2]] - logs[..., [1]]
-    usual = np.nanmedian(ratios, axis=0)
-    if _shape(grey) < CURVED and np.quantile(np.abs(usual - np.median(usual, axis=0)), PART) < SEVERAL:
-        return []
-    most = np.zeros(len(lit))
-    for index, seen in enumerate(lit):
-        if seen.sum() < max(FEWEST_LIT, MOST_LIT * kept.sum()):
-            continue
-        away = (ratios[index] - usual)[seen]
-        change = np.median(away, axis=0)
-        alike = np.quantile(np.abs(away - change), PART, axis=0) < ALIKE * np.abs(change)
-        most[index] = np.abs(change)[alike].max(initial=0)
-    index = int(most.argmax())
-    if (most > COLOURS).mean() < MANY:
-        return []
-    return [f"frames[].light.irradiance: the colours of the images change from one to the next, by {100 * np.expm1(most[index]):.0f} % in "
-            f"{list(frames)[index]}, as under automatic white balance or lamps of several colours: fix the white balance, or declare the "
-            "irradiance of each channel"]
 
 
 def _turned_mask(mask: np.ndarray, frames: Sequence[Seen]) -> list[str]:
