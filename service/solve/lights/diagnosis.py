@@ -48,7 +48,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     field = FIELDS.get(type(lights), "the capture of the reference ball")
     if given.mask.all():
         seen = lit_object(solution.albedo.astype(np.float32).mean(axis=0).reshape(given.mask.shape))
-        given = replace(given, mask=seen) if seen.mean() < FILLS else given
+        given = replace(given, mask=seen) if 0 < seen.mean() < FILLS else given
     fit = None
     if isinstance(lights, DistantLights):
         assert isinstance(declared, DistantLights)
