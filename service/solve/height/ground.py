@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import maximum_filter
 
 from kernels.photometric.lambertian.readings import Lights
 from service.light_estimation.lambertian import fit_lambertian
@@ -27,6 +27,8 @@ LIKELY = np.array([0.1, 0.2, 0.4, 0.3])
 """Likelihood of each way before the readings are asked: what is around the object lights it not, or reaches so far."""
 BLOCKS = 32
 """Blocks of the ground along the longer side of the image: what stands on it hides parts of it, and throws shadows there."""
+FINE = 8
+"""Most pixels along a side of a block that are looked at."""
 MARGIN = 0.01
 """Part of the longer side of the image, around the mask, in which a pixel may show the object."""
 BELOW = 0.5
@@ -40,20 +42,23 @@ LEAST_COSINE = 0.2
 
 
 def light_from_ground(given: SolveInput, lights: Lights, patches: Patches, height: wp.array) -> np.ndarray | None:
-    """Return the light that the ground throws on each patch of an object, [ways, patches, 3, lights] as of `ArrivingLight`: none, and
-    as much as it is by REACHES. None where they show no ground, or a dark one. `height`: [rows, cols] float32 on
-    the device."""
+    """Return the light that the ground throws on each patch of an object, [ways, patches, 3, lights] as of `ArrivingLight`: none, and that
+    by each of REACHES. None where the images show no ground, or a dark one. `height`: [rows, cols] float32 on the device."""
     rows, cols = given.mask.shape
     side = math.ceil(max(rows, cols) / BLOCKS)
     shape = (-(-rows // side), -(-cols // side))
-    free = np.flatnonzero(~binary_dilation(given.mask, iterations=math.ceil(MARGIN * max(rows, cols))))
-    block = free // cols // side * shape[1] + free % cols // side
-    shown = (np.bincount(block, minlength=shape[0] * shape[1]) >= LEAST_COVER * side**2).reshape(shape)
+    step = math.ceil(side / FINE)
+    grown = maximum_filter(given.mask, 2 * math.ceil(MARGIN * max(rows, cols)) + 1)
+    row, col = (axis.ravel() for axis in np.mgrid[step // 2:rows:step, step // 2:cols:step])
+    block = row // side * shape[1] + col // side
+    free = ~grown[row, col]
+    looked, found = (np.bincount(block[some], minlength=shape[0] * shape[1]) for some in (slice(None), free))
+    shown = (found > LEAST_COVER * looked).reshape(shape)
     if not shown.any():
         return None
     number = np.where(shown, np.cumsum(shown).reshape(shape) - 1, -1)
-    inside = shown.flat[block]
-    seen = patch_radiance(given.stack, lights, free[inside], number.flat[block[inside]], int(shown.sum()))
+    inside = free & shown.flat[block]
+    seen = patch_radiance(given.stack, lights, (row * cols + col)[inside], number.flat[block[inside]], int(shown.sum()))
     if seen.mean() <= LEAST_RADIANCE * patches.radiance.mean():
         return None
     facing, usual = _facing(seen, lights), np.median(seen, axis=0)
