@@ -116,7 +116,7 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         found = findings(capture, looked, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
                                            if level.picked is not None})
     looks = [*capture.doubts, *found.sentences]
-    looks += [] if faults else [said for said in said_by_readings(capture) if said not in capture.doubts]
+    looks += [] if faults else said_by_readings(capture)
     if request.picture is not None:
         peak = max((level.peak for level in read), default=1.0)
         facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, request.review, timings)))

@@ -98,8 +98,7 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
     if over_time is None:  # else twelve images of each step would be read twice
-        shown = tuple(sentence for sentence in said_by_readings(capture) if sentence not in capture.doubts)
-        capture = replace(capture, doubts=(*capture.doubts, *shown))
+        capture = replace(capture, doubts=(*capture.doubts, *said_by_readings(capture)))
     pairs = None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))

@@ -58,7 +58,7 @@ class Seen(NamedTuple):
 
 
 def said_by_readings(capture: Capture) -> list[str]:
-    """Return a sentence for each of these that some frames of a capture under lights show."""
+    """Return a sentence for each of these that some frames of a capture under lights show and its doubts do not say already."""
     lit = [(frame, frame.light) for frame in capture.manifest.frames if isinstance(frame.light, DistantLight | PointLight)]
     if len(lit) < FEWEST_FRAMES or capture.is_polarised:
         return []
@@ -79,7 +79,8 @@ def said_by_readings(capture: Capture) -> list[str]:
                     *(at.corrected(flat[places][:, None], frame)[:, 0] / strength for places, at in some))
 
     seen = [see(*lit[index]) for index in _evenly(np.arange(len(lit)), MOST_FRAMES)]
-    return [*_clipped(capture.manifest.saturation, seen), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
+    said = [*_clipped(capture.manifest.saturation, seen), *_turned_mask(mask, seen), *([CLEAR] if clear else [])]
+    return [sentence for sentence in said if sentence not in capture.doubts]
 
 
 def _evenly(places: np.ndarray, count: int) -> np.ndarray:

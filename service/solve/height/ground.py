@@ -41,35 +41,50 @@ LEAST_COSINE = 0.2
 """Cosine between the ground and the line of sight below which a block of it has no certain place."""
 
 
-def light_from_ground(given: SolveInput, lights: Lights, patches: Patches, height: wp.array) -> np.ndarray | None:
-    """Return the light that the ground throws on each patch of an object, [ways, patches, 3, lights] as of `ArrivingLight`: none, and that
-    by each of REACHES. None where the images show no ground, or a dark one. `height`: [rows, cols] float32 on the device."""
-    rows, cols = given.mask.shape
-    side = math.ceil(max(rows, cols) / BLOCKS)
-    shape = (-(-rows // side), -(-cols // side))
-    step = math.ceil(side / FINE)
-    grown = maximum_filter(given.mask, 2 * math.ceil(MARGIN * max(rows, cols)) + 1)
-    row, col = (axis.ravel() for axis in np.mgrid[step // 2:rows:step, step // 2:cols:step])
-    block = row // side * shape[1] + col // side
-    free = ~grown[row, col]
-    looked, found = (np.bincount(block[some], minlength=shape[0] * shape[1]) for some in (slice(None), free))
-    shown = (found > LEAST_COVER * looked).reshape(shape)
-    if not shown.any():
-        return None
-    number = np.where(shown, np.cumsum(shown).reshape(shape) - 1, -1)
-    inside = free & shown.flat[block]
-    seen = patch_radiance(given.stack, lights, (row * cols + col)[inside], number.flat[block[inside]], int(shown.sum()))
-    if seen.mean() <= LEAST_RADIANCE * patches.radiance.mean():
-        return None
-    facing, usual = _facing(seen, lights), np.median(seen, axis=0)
-    light = np.zeros((len(LIKELY), *patches.radiance.shape), np.float32)
-    for reach, blocks in _rings(shown, side):
-        ground, placed = _plane(given, patches, facing, blocks)
-        if len(placed):
-            radiance = seen[placed] if reach == 1 else np.repeat(usual[None], len(placed), axis=0)
-            sent = ground._replace(radiance=radiance).light_on(patches, height, projection_of(given.camera))
-            light[1 + np.flatnonzero(np.array(REACHES) >= reach)] += sent
-    return light
+class Ground(NamedTuple):
+    """What the images show of the ground."""
+
+    given: SolveInput
+    seen: np.ndarray  # [blocks, 3, lights] radiance over irradiance
+    shown: np.ndarray  # [rows, cols] bool, by blocks: where they are
+    side: int
+    """Pixels along a side of a block."""
+    facing: np.ndarray  # [3] unit normal
+
+    @classmethod
+    def of(cls, given: SolveInput, lights: Lights, patches: Patches) -> "Ground | None":
+        """Return the ground below an object, or None where the images show none, or a dark one."""
+        rows, cols = given.mask.shape
+        side = math.ceil(max(rows, cols) / BLOCKS)
+        shape = (-(-rows // side), -(-cols // side))
+        step = math.ceil(side / FINE)
+        grown = maximum_filter(given.mask, 2 * math.ceil(MARGIN * max(rows, cols)) + 1)
+        row, col = (axis.ravel() for axis in np.mgrid[step // 2:rows:step, step // 2:cols:step])
+        block = row // side * shape[1] + col // side
+        free = ~grown[row, col]
+        looked, found = (np.bincount(block[some], minlength=shape[0] * shape[1]) for some in (slice(None), free))
+        shown = (found > LEAST_COVER * looked).reshape(shape)
+        if not shown.any():
+            return None
+        number = np.where(shown, np.cumsum(shown).reshape(shape) - 1, -1)
+        inside = free & shown.flat[block]
+        seen = patch_radiance(given.stack, lights, (row * cols + col)[inside], number.flat[block[inside]], int(shown.sum()))
+        if seen.mean() <= LEAST_RADIANCE * patches.radiance.mean():
+            return None
+        return cls(given, seen, shown, side, _facing(seen, lights))
+
+    def light_on(self, patches: Patches, height: wp.array) -> np.ndarray:
+        """Return the light that it throws on each patch of the object, [ways, patches, 3, lights] as of `ArrivingLight`: none, and that by
+        each of REACHES. `height`: [rows, cols] float32 on the device."""
+        usual = np.median(self.seen, axis=0)
+        light = np.zeros((len(LIKELY), *patches.radiance.shape), np.float32)
+        for reach, blocks in _rings(self.shown, self.side):
+            ground, placed = _plane(self.given, patches, self.facing, blocks)
+            if len(placed):
+                radiance = self.seen[placed] if reach == 1 else np.repeat(usual[None], len(placed), axis=0)
+                sent = ground._replace(radiance=radiance).light_on(patches, height, projection_of(self.given.camera))
+                light[1 + np.flatnonzero(np.array(REACHES) >= reach)] += sent
+        return light
 
 
 class _Blocks(NamedTuple):

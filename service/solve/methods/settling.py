@@ -23,7 +23,7 @@ from service.solve.height.beyond import LIKELY as GOES_ON
 from service.solve.height.beyond import light_from_beyond
 from service.solve.height.direct_light import DirectLight
 from service.solve.height.ground import LIKELY as ON_GROUND
-from service.solve.height.ground import light_from_ground
+from service.solve.height.ground import Ground
 from service.solve.height.height import projection_of
 from service.solve.height.interreflection import Patches, patches_of
 from service.solve.methods.bounce_evidence import Evidence, is_lit_by_bounces, middles_of
@@ -96,14 +96,14 @@ def settle(light: DirectLight, normal: np.ndarray, shape: LobeShape, pick: Calla
     within = middles_of(light, pick)
     told = Evidence(within, normal[:, within.pixels].T, shape, pick, relative)
     patches = patches_of(light.given, light.lights, normal, light.height, within.solved)
-    sent = None if patches is None else _sent_by_ground(light, patches, told)
-    if sent is not None:
-        light = light.with_more(sent.mean)
+    ground = None if patches is None else Ground.of(light.given, light.lights, patches)
+    if patches is not None and ground is not None:
+        light = light.with_more(_sent_by(ground, light, patches, told).mean)
     shown = shown_bounce(*told.in_shadow(light))
     bounced = is_lit_by_bounces(told.cost_of(light), relative=relative) if shown is None else has_bounced(light, shown)
     if not bounced:
         return Settled(light._replace(arriving=None), shown)
-    return _in_rounds(light, normal, told, direct=direct)._replace(shown=shown)
+    return _in_rounds(light, normal, told, ground, direct=direct)._replace(shown=shown)
 
 
 class _Sent(NamedTuple):
@@ -120,10 +120,10 @@ class _Sent(NamedTuple):
         return np.tensordot(self.likely, self.ways, 1)
 
 
-def _sent_by_ground(light: DirectLight, patches: Patches, told: Evidence) -> _Sent | None:
-    """Return the light of the ground, or None where the images show none."""
-    ways = light_from_ground(light.given, light.lights, patches, light.height)
-    return None if ways is None else _Sent(ways, told.likelihoods(light, ways, ON_GROUND))
+def _sent_by(ground: Ground, light: DirectLight, patches: Patches, told: Evidence) -> _Sent:
+    """Return the light of the ground."""
+    ways = ground.light_on(patches, light.height)
+    return _Sent(ways, told.likelihoods(light, ways, ON_GROUND))
 
 
 def _sent_from_beyond(light: DirectLight, patches: Patches, told: Evidence) -> _Sent | None:
@@ -133,7 +133,7 @@ def _sent_from_beyond(light: DirectLight, patches: Patches, told: Evidence) -> _
     return None if ways is None else _Sent(ways, told.likelihoods(light, ways, GOES_ON))
 
 
-def _in_rounds(light: DirectLight, first: np.ndarray, told: Evidence, *, direct: bool) -> Settled:
+def _in_rounds(light: DirectLight, first: np.ndarray, told: Evidence, ground: Ground | None, *, direct: bool) -> Settled:
     """Return the light after the rounds. `first`: [3, pixels], the normals before them, of which `told` is. `direct` as of `settle`."""
     solved, block, middles, whole = told.within
     pixels, albedo, start, camera = np.flatnonzero(solved), light.albedo, told.normal, light.given.camera
@@ -148,8 +148,8 @@ def _in_rounds(light: DirectLight, first: np.ndarray, told: Evidence, *, direct:
         patches = patches_of(light.given, light.lights, again, light.height, solved)
         assert patches is not None  # what is solved, and so is a patch, stays the same
         light = light._replace(arriving=patches.arriving(light.height, projection_of(camera)), albedo=dimmed)
-        ground = _sent_by_ground(light, patches, told)
-        light = light if ground is None else light.with_more(ground.mean)
+        below = None if ground is None else _sent_by(ground, light, patches, told)
+        light = light if below is None else light.with_more(below.mean)
         beyond = _sent_from_beyond(light, patches, told)
         light = light if beyond is None else light.with_more(beyond.mean)
     settled, fit = told.with_strength(light, told.cost_of(light))
@@ -169,12 +169,12 @@ def _in_rounds(light: DirectLight, first: np.ndarray, told: Evidence, *, direct:
 
     goes_on = turn_by(beyond, None)
     parts = [turn(settled._replace(albedo_scale=(1 + unknown) * settled.albedo_scale)), goes_on,
-             turn_by(ground, None if ground is None else ground.likely)]
+             turn_by(below, None if below is None else below.likely)]
     degrees = np.zeros(solved.size, np.float32)
     degrees[pixels] = np.linalg.norm(parts, axis=0)[block]
     assert settled.arriving is not None
     return Settled(settled, None, True, fit, degrees, None if beyond is None else float(np.percentile(goes_on, 95)),
-                   None if ground is None else float(ground.mean.sum() / max(settled.arriving.light.sum(), 1e-12)))
+                   None if below is None else float(below.mean.sum() / max(settled.arriving.light.sum(), 1e-12)))
 
 
 def _turn(normals: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:

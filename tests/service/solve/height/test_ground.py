@@ -9,7 +9,7 @@ import warp as wp
 
 from kernels.photometric.lambertian.readings import pad_lights
 from service.requests.solve import Method, SolveRequest
-from service.solve.height.ground import light_from_ground
+from service.solve.height.ground import Ground
 from service.solve.height.interreflection import patches_of
 from service.solve.solve import solve
 from stage.capture.camera import Camera
@@ -37,8 +37,9 @@ def light_on_speck(camera, normal, *, ground, up=(0.0, 0.0, 1.0)):
     lights = pad_lights(LIGHTS, np.ones((len(LIGHTS), 3)))
     normals = np.repeat(np.asarray(normal, np.float32)[:, None], SIDE**2, axis=1)
     on_device = wp.array(height, device="cpu")
-    light = light_from_ground(given, lights, patches_of(given, lights, normals, on_device, mask), on_device)
-    return None if light is None else light[:, 0]
+    patches = patches_of(given, lights, normals, on_device, mask)
+    below = Ground.of(given, lights, patches)
+    return None if below is None else below.light_on(patches, on_device)[:, 0]
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
@@ -60,7 +61,7 @@ def test_dark_ground_sends_nothing():
 
 def test_without_ground_nothing_is_sent():
     mask = np.ones((4, 4), bool)
-    assert light_from_ground(SimpleNamespace(mask=mask), None, None, None) is None
+    assert Ground.of(SimpleNamespace(mask=mask), None, None) is None
 
 
 @pytest.mark.parametrize("tilt", [0.0, pytest.param(45.0, marks=pytest.mark.long)])
