@@ -189,9 +189,11 @@ def raise_undescribed(solution: Solution) -> None:
     """Make normals less sure, and say so, where the readings of left-out lights are predicted by no model."""
     if "left_out_misfit" not in solution.facts:
         return
-    general, lambert, shared = (solution.facts[name] for name in ("left_out_misfit", "left_out_misfit_lambert", "left_out_shared"))
-    if is_supported(general, lambert) or min(general, lambert) < UNDESCRIBED or shared < SHARED:
+    general, lambert, robust, shared = (solution.facts[name] for name in ("left_out_misfit", "left_out_misfit_lambert",
+                                                                          "left_out_misfit_robust", "left_out_shared"))
+    least = min(general, lambert, robust)
+    if is_supported(general, lambert) or least < UNDESCRIBED or shared < SHARED:
         return
-    raise_error(solution, DEGREES * min(general, lambert))
+    raise_error(solution, DEGREES * least)
     solution.warnings.append("method svbrdf: the object reflects neither by Lambert's law nor with highlights, as velvet does not: the "
                              "normals are only as sure as the layer sigma says; a ball of its material tells more (--reference-ball)")

@@ -5,7 +5,8 @@ import pytest
 
 from benchmarks.trials.declared import Case, write
 from service.requests.solve import Method, SolveRequest
-from service.solve.methods.support import SHARED, is_supported, leave_out, simpler_normals
+from service.solve.base.solution import Solution
+from service.solve.methods.support import SHARED, is_supported, leave_out, raise_undescribed, simpler_normals
 from service.solve.solve import solve
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
 from tests.reference import microfacet as twin
@@ -107,3 +108,12 @@ def test_lobes_that_predict_no_better_still_tell_normals(tmp_path):
 ])
 def test_lambert_is_no_refuge_where_it_does_not_describe_the_object(general, lambert, supported):
     assert is_supported(general, lambert) == supported
+
+
+@pytest.mark.parametrize("robust", [0.2, 0.45])
+def test_what_robust_describes_is_no_velvet(robust):
+    """Folded paper under eight lights, path traced: least squares and lobes follow bounced light and shadows (0.5), middle ranks do not."""
+    solution = Solution.empty(4)
+    solution.facts |= {"left_out_misfit": 0.51, "left_out_misfit_lambert": 0.5, "left_out_misfit_robust": robust, "left_out_shared": 0.5}
+    raise_undescribed(solution)
+    assert len(solution.warnings) == (robust > 0.3)
