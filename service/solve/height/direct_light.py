@@ -101,8 +101,8 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     if parts and field is None:
         surface, placed = place_parts(given, lights, normal, material, surface, to_numpy(height), whole)
         height = wp.array(placed.height, dtype=float, device=given.device)
-    arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
     part = surface.part
-    mask = solved.astype(np.uint8) if part is None else numbered(part)
+    mask = solved.astype(np.uint8) if part is None else numbered(part)  # a pixel may be solved and of no part
+    arriving = arriving_light(given, lights, normal, height, mask > 0) if interreflection else None
     on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
     return DirectLight(given, lights, field, on_device, height, extent_of(to_numpy(height), mask), shadows, arriving, bouncing)
