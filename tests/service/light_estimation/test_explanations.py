@@ -48,20 +48,18 @@ def test_three_planes_tell_no_directions(alpha):
     assert better_explanation(sample, fit_manifest(sample)) is None
 
 
-@pytest.mark.parametrize("noise", [0.002, 0.03])
-def test_few_directions_must_explain_what_faces_otherwise_as_well_as_a_plane(noise):
-    """Under twelve lights a plate that shines looks like one under other lights, and what stands on it decides. The noise of
-    the plate is 0.2 %."""
+@pytest.mark.parametrize("count", [12, 20])
+def test_few_lights_of_other_directions_must_leave_more(count):
+    """A plate that shines and what stands on it leave 6 % under twelve right lights; here other directions leave 8 %."""
     draw = np.random.default_rng(1)
     lights = fibonacci_sphere(80)
-    lights = draw.permutation(lights[lights[:, 2] > 0.4])[:12]
+    lights = draw.permutation(lights[lights[:, 2] > 0.4])[:count]
     other = unit(lights + 0.3 * draw.normal(size=lights.shape) * [1, 1, 0.3])
     around = unit(draw.normal(size=(150, 3)) * [0.5, 0.5, 0] + [0, 0, 1])
     readings = np.maximum(other @ np.concatenate([np.tile([0.1, 0.1, 1.0], (450, 1)), around]).T, 0)
-    readings *= 1 + np.repeat([0.002, noise], [450, 150]) * draw.normal(size=readings.shape)
-    sample = sample_of(readings, lights)
+    sample = sample_of(readings * (1 + 0.002 * draw.normal(size=readings.shape)), lights)
     found = better_explanation(sample, fit_manifest(sample))
-    assert found is None if noise > 0.01 else found.cause is Cause.DIRECTIONS
+    assert found is None if count < 16 else found.cause is Cause.DIRECTIONS
 
 
 def test_what_fits_beside_metal_tells_that_axes_are_right():
