@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stage.errors import storage
+from stage.errors import StorageError, storage
 
 _umask_lock = threading.Lock()
 _TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., eight characters of mkstemp, SUFFIX
@@ -41,6 +41,17 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
             os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Raise StorageError unless a file or folder can be made at a path, whose missing parents are made with it."""
+    existing = path.parent
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise StorageError(f"cannot write {path}: not a directory")
+    if not os.access(existing, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        raise StorageError(f"cannot write {path}: permission denied")
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -39,7 +39,7 @@ from service.cli.colours import OcioOption, colours
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
-from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
+from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, require_outputs, typed, typed_name
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
@@ -122,6 +122,8 @@ def command(group: typer.Typer, name: str, function: Callable[..., None], *, wit
             for name, model in models.items():
                 given = Given(model, {option.name: values[option.name] for option in options_of(model) if option.name in was_typed})
                 arguments[name] = given if name in lazy else given.build()
+                if local and name not in lazy:
+                    require_outputs(arguments[name])
             function(**arguments)
 
     signature = [inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context),

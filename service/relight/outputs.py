@@ -21,7 +21,8 @@ from service.requests.light.picture_options import FrameMatte, Layer
 from service.requests.relight import RelightRequest
 from stage.colour.configuration import current
 from stage.colour.location import BUILT_IN, location
-from stage.errors import StageError, StorageError
+from stage.errors import StageError
+from stage.files import require_writable
 from stage.formats import exr, exr_scan
 from stage.stack import fingerprint
 
@@ -73,14 +74,8 @@ def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -
     folders: dict[Path, Path] = {}
     for _, path in outputs:
         folders.setdefault(path.parent, path)
-    for folder, path in folders.items():
-        existing = folder
-        while not existing.exists() and existing != existing.parent:
-            existing = existing.parent
-        if not existing.is_dir():
-            raise StorageError(f"cannot write {path}: not a directory")
-        if not os.access(existing, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
-            raise StorageError(f"cannot write {path}: permission denied")
+    for path in folders.values():
+        require_writable(path)
 
 
 def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequence[ScheduledFrame], environments: Environments | None,

@@ -14,12 +14,14 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from inspect import get_annotations
 from keyword import iskeyword
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from service.requests.base.base import Choice, Commas, Options, Role, Spelling
+from stage.files import require_writable
 
 Model = TypeVar("Model", bound=Options)
 
@@ -125,6 +127,13 @@ def nested(field: FieldInfo) -> type[Options] | None:
     """Return the model whose fields are options of the model around it, or None where the field is one value."""
     kind, _ = _value_type(field)
     return kind if isinstance(kind, type) and issubclass(kind, Options) else None
+
+
+def require_outputs(request: BaseModel) -> None:
+    """Raise StorageError where results cannot be written: before the work, which may take hours, and not after it."""
+    for option, value in values_of(request):
+        if option.role is Role.OUTPUT and isinstance(value, Path):
+            require_writable(value)
 
 
 def is_document(kind: Any) -> bool:

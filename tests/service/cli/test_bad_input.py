@@ -235,6 +235,17 @@ def test_frames_into_a_locked_folder_are_refused_before_any_work(relit_as_nobody
     assert not (open_folder / "cache").exists() and files_in(out) == set()
 
 
+@pytest.mark.parametrize("arguments", [("solve", "cap", "--out"), ("view", "cap", "--out"), ("publish", "cap", "--as", "web", "--to"),
+                                       ("basis", "cap", "--out")])
+def test_results_below_a_file_are_refused_before_any_work(relit, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "cap", SCENE)
+    before = files_in(tmp_path)
+    (tmp_path / "file").write_text("")
+    relit(*arguments, "file/out.exr", "--cache", "cache").refused("cannot write file/out.exr: not a directory")
+    assert files_in(tmp_path) == before | {"file"}
+
+
 @pytest.mark.parametrize(("stage", "limit", "words"), [
     ("stack", 2500, "cannot make the stack cache"),
     ("maps", 2000, "cannot write"),
