@@ -155,6 +155,12 @@ def test_an_interruption_ends_with_130_and_a_sentence_and_a_defect_of_ours_keeps
     outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
     assert outcome.code == 130
     assert outcome.err.startswith("relit: interrupted") and outcome.err.count("\n") == 1
+    monkeypatch.setattr(service.cli.main, "program", interrupt)  # while modules are loaded
+    monkeypatch.setattr(sys, "argv", ["relit", "info", str(tmp_path)])
+    with pytest.raises(SystemExit, match="130"):
+        main()
+    monkeypatch.undo()
+
     def fail(*arguments, **options):
         raise ZeroDivisionError
 
