@@ -119,6 +119,8 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
         warnings += multiplied_sentences({around.environment.name: read_header(around.environment).multiplied})
     if (plain := _plain(maps)) is not None:
         warnings.append(plain)
+    if request.maps.is_dir() and (depth := request.maps / DEPTH_FILE).exists():
+        warnings.append(f"{request.maps}: holds a depth too, and the asset is of {MAPS_FILE}: name {depth} for an asset of the depth")
     if around.rig is not None and (doubt := other_manifest(maps.camera, maps.provenance, around.rig, path)) is not None:
         warnings.append(doubt)
     if maps.status is not None and (doubtful := doubtful_normals(maps.status)) is not None:

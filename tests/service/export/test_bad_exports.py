@@ -10,6 +10,7 @@ from pxr import Usd
 from kernels.status import Status
 from service.asset.usd.asset import write_asset
 from service.asset.usd.inspect import inspect_usd
+from stage.results.depth_maps import DepthMaps
 from tests.scenes.captures import write_exr
 from tests.scenes.surfaces import make_ball
 
@@ -139,6 +140,14 @@ def test_an_asset_that_is_grey_or_clipped_is_said_and_a_version_is_a_text(relit,
     assert f"{BALL.mask.sum()} pixels have a value outside 0…1" in relit("export", tmp_path, "--out", tmp_path / "a.usdz").well()
     relit("export", tmp_path, "--out", tmp_path / "b.usdz", "--version", "").refused("version")
     assert not (tmp_path / "b.usdz").exists()
+
+
+def test_of_maps_and_a_depth_in_one_folder_the_asset_says_which_it_is_of(relit, tmp_path):
+    BALL.write(tmp_path / "maps.exr")
+    DepthMaps(camera=BALL.camera, mask=BALL.mask, depth=np.where(BALL.mask, 1, 0).astype(np.float32)).write(tmp_path / "depth.exr")
+    assert f"{tmp_path}: holds a depth too" in relit("export", tmp_path, "--out", tmp_path / "a.usdz").well()
+    for chosen in (tmp_path / "maps.exr", tmp_path / "depth.exr"):
+        assert "holds a depth too" not in relit("export", chosen, "--out", tmp_path / "b.usdz").well()
 
 
 @pytest.mark.parametrize(("ambiguous", "words"), [(1.0, "no normal is sure"), (0.5, "% of the solved normals are ambiguous"), (0.1, None)])
