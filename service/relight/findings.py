@@ -24,11 +24,11 @@ KEPT_BACKGROUND = ("none: the background is lit, so the frames keep it and A is 
                    "partial values does so softly")
 PLAIN_BEYOND = ("there the nearest captured lights stand in, so that shading and shadows are wrong and most pixels too bright; --maps "
                 "corrects the shading, lights captured there correct both")
-GUIDED_BEYOND = ("there the model of --maps is followed, as far as the captured lights confirm it, with the shadows of the nearest "
+GUIDED_BEYOND = ("there the model of the maps is followed, as far as the captured lights confirm it, with the shadows of the nearest "
                  "captured lights; lights captured there show their own shadows")
 SHORTER = "add shorter exposures of these lights to the capture (exposure_s)"
 PLAIN_CLIPPED = "too dark by an unknown amount; " + SHORTER
-GUIDED_CLIPPED = "taken from the model of --maps where it is brighter; " + SHORTER
+GUIDED_CLIPPED = "taken from the model of the maps where it is brighter; " + SHORTER
 
 
 @dataclass

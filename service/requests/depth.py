@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
 from service.requests.base.base import (
     CAPTURE,
@@ -22,6 +22,15 @@ from stage.model import Count, Finite, Fraction, NotNegative, Positive, Vector
 
 def _without_blanks(given: Any) -> Any:
     return tuple(name for name in given if name) if isinstance(given, tuple) else given
+
+
+def _beyond_near(far_m: float, given: ValidationInfo) -> float:
+    if (near_m := given.data.get("near_m")) is not None and far_m <= near_m:
+        raise ValueError(f"is {far_m:g} m, not beyond the nearest that is asked for, {near_m:g} m")
+    return far_m
+
+
+FarDistance = Annotated[Positive, AfterValidator(_beyond_near)]
 
 
 class Ranging(Choice):
@@ -78,7 +87,7 @@ class DepthOptions(PixelOptions):
     """The kind of frames to use; needed only where a capture has several kinds."""
     near_m: Positive | None = None
     """Nearest depth in metres; pixels below have the status out of range."""
-    far_m: Positive | None = None
+    far_m: FarDistance | None = None
     """Farthest depth in metres; pixels above have the status out of range."""
     max_residual_px: Positive = 4.0
     """Where both column and row are decoded: how many projector pixels the decoded place may be away from where the projector sees the
@@ -123,7 +132,7 @@ class ScanOptions(Options):
 
     near_m: Positive | None = None
     """Returns nearer than this, in metres, are left out."""
-    far_m: Positive | None = None
+    far_m: FarDistance | None = None
     """Returns farther than this, in metres, are left out."""
     las: bool = False
     """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""

@@ -228,8 +228,9 @@ def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     (POSE * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]]), (), "give the translation in metres"),
     (POSE * [-1, 1, -1, 1], (), "the projector lights nothing that the camera sees"),
     (np.eye(4), (), "without a baseline there is no depth"),
+    (POSE, ("--near-m", 2, "--far-m", 1), "--far-m: is 1 m, not beyond the nearest that is asked for, 2 m"),
     (POSE, ("--near-m", 0.1, "--far-m", 0.5), "no pixel has a depth .*out_of_range.* within --near-m 0.1 and --far-m 0.5: give"),
-], ids=["millimetres", "turned", "nowhere", "near"])
+], ids=["millimetres", "turned", "nowhere", "near beyond far", "near"])
 def test_impossible_devices_are_named(relit, tmp_path, pose, options, words):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
     edit_manifest(tmp_path, projector=lambda projector: {**projector, "camera_from_projector": pose.tolist()})

@@ -81,7 +81,7 @@ def test_a_model_that_is_brighter_fills_clipped_readings_in(relit, capture):
     plain, _ = relight(relit, capture, capture / "b", "--weights", "smooth")
     guided, out = relight(relit, capture, capture / "c", "--maps", write_maps(capture / "maps", SURFACE))
     assert SURFACE.off(guided, truth) < 0.4 * SURFACE.off(plain, truth)
-    assert "taken from the model of --maps" in out
+    assert "taken from the model of the maps" in out
 
 
 def test_integers_at_full_scale_are_clipped_without_a_word_in_the_manifest(relit, capture):

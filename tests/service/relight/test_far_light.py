@@ -69,7 +69,7 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
 def test_the_share_of_such_light_is_said(relit, scene, tmp_path):
     folder, _ = scene
     maps = write_maps(tmp_path / "maps", SURFACE)
-    for options, words in (((), "the nearest captured lights stand in"), (("--maps", maps), "the model of --maps is followed")):
+    for options, words in (((), "the nearest captured lights stand in"), (("--maps", maps), "the model of the maps is followed")):
         _, out = relight(relit, folder, tmp_path / str(len(options)), *options)
         warning, = (line for line in out.splitlines() if line.startswith("warning"))
         share = float(warning.split()[1])
