@@ -185,8 +185,9 @@ def _check_plausible(solution: DepthSolution, capture: Capture, request: DepthRe
                                     "give the metres between which the scene lies")
             raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): "
                                 f"{'; '.join(solution.warnings) or _advice(counts, using)}")
+        alone = "" if request.max_sigma is None else "without --max-sigma, "
         solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
-                                 "--least-confidence 0 counts unsure ones as solved")
+                                 f"{alone}--least-confidence 0 counts unsure ones as solved")
     middle = float(np.median(solution.depth[estimated]))
     field = KINDS[using].lengths if request.beside is None else "camera.world_from_camera"
     if field is not None and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:

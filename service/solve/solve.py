@@ -165,7 +165,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     if above > MANY_ABOVE_ONE * solved.sum() and method is not Method.REFERENCE:
         solution.warnings.append(_above_one(above / solved.sum(), capture, shining=solution.specular is None))
     if not solved.any():
-        solution.warnings.append(_nothing_solved(counts))
+        solution.warnings.append(_nothing_solved(counts, request.least_confidence))
     elif (doubtful := doubtful_normals(status)) is not None:
         solution.warnings.append(doubtful)
     solution.warnings += height_warnings(judged.guessed, method, mask)
@@ -270,10 +270,11 @@ def _lobes_of_mixtures(solution: Solution, image: Callable[[np.ndarray], np.ndar
     return layers
 
 
-def _nothing_solved(counts: Mapping[str, int]) -> str:
+def _nothing_solved(counts: Mapping[str, int], least_confidence: float | None) -> str:
     common = max(counts, key=lambda name: counts[name])
     share = 100 * counts[common] / max(sum(counts.values()), 1)
-    keep = ("; --max-sigma 180 keeps unsure normals" if common == Status.UNSURE.name.lower() else
+    alone = " without --least-confidence" if least_confidence else ""
+    keep = (f"; --max-sigma 180{alone} keeps unsure normals" if common == Status.UNSURE.name.lower() else
             "; check the lights, the exposure and the mask")
     return f"no pixel is solved: {share:.0f} % of the mask have the status {common}, and the layer status says why for every pixel{keep}"
 

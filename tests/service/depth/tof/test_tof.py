@@ -80,6 +80,7 @@ def test_depths_that_are_all_unsure_are_written_and_the_command_says_so(relit, t
     folder = write(tmp_path / "c", cw_frames(tof.correlations(VIEW, 1e5, settings, ambient=20, seed=5), settings))
     outcome = relit("depth", folder, "--out", tmp_path / "out", "--max-sigma", "1e-6")
     assert outcome.code == 1 and "warning  no depth is sure enough to count as solved" in outcome.out
+    assert "without --max-sigma, --least-confidence 0 counts" in outcome.out
     maps = DepthMaps.read(tmp_path / "out" / "depth.exr", unsure=True)
     assert not maps.mask.any() and maps.estimated.mean() > 0.9
     assert np.median(np.abs(maps.range - VIEW.distance)[maps.estimated]) < 0.01  # the first row of the figures above
