@@ -148,7 +148,7 @@ def depth_results(source: Path) -> list[str]:
 
 def _scans(folder: Folder) -> Guess | None:
     if (layout := frame_layout(folder.path)) is not None:
-        words: tuple[object, ...] = ("scans", folder.path)
+        words: tuple[object, ...] = ("scans", folder.path, "SCAN_SET")
         assumed = [f"a unit of depth is {layout.unit_m:g} m: else --depth-unit-m"]
         if read_intrinsics(folder.path) is None:
             words += ("--intrinsics", "FX,FY,CX,CY")
@@ -161,9 +161,10 @@ def _scans(folder: Folder) -> Guess | None:
     clouds = [name for name in folder.names if name.lower().endswith(POINT_FILES)]
     if not clouds or folder.pictures:
         return None
-    found = made("scans of one object", f"it has {len(clouds)} files of points, as {clouds[0]}", ["scans", folder.path], folder.path,
-                 solve=False, assumed=("coordinates are in metres: else --unit mm",))
-    if not all(name.lower().endswith(".ply") for name in clouds):  # they are converted
+    converted = ["SCAN_SET"] if not all(name.lower().endswith(".ply") for name in clouds) else []
+    found = made("scans of one object", f"it has {len(clouds)} files of points, as {clouds[0]}", ["scans", folder.path, *converted],
+                 folder.path, solve=False, assumed=("coordinates are in metres: else --unit mm",))
+    if converted:
         return found._replace(then="relit register SCAN_SET --out registered")
     return found._replace(then=shlex.join(["relit", "register", str(folder.path), "--out", f"{folder.path.resolve().name}-registered"]))
 

@@ -65,7 +65,7 @@ def test_frames_of_tum(relit, tmp_path, views):
     lines = [" ".join(map(str, row)) for row in [[10.0, 9, 9, 9, 0, 0, 0, 1], *rows, [10.09, 9, 9, 9, 0, 0, 0, 1]]]
     (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
     guessed = relit.done("import", "guess", folder).out
-    assert "TUM" in guessed and "--intrinsics FX,FY,CX,CY" in guessed
+    assert "TUM" in guessed and f"relit import scans {folder} SCAN_SET --intrinsics FX,FY,CX,CY" in guessed
     assert "give --intrinsics FX,FY,CX,CY" in relit.refused("import", "scans", folder, tmp_path / "none")
     said = relit.done("import", "scans", folder, tmp_path / "set", "--intrinsics", ",".join(map(str, centred(views[0])))).out
     assert "0.0002 m a unit" in said and "2 of 2" in said

@@ -65,7 +65,7 @@ def test_points_of_other_programs_become_scans(relit, tmp_path, folder, name, co
     cloud = read_ply(tmp_path / "set" / "a.ply")
     assert cloud.points == pytest.approx(CORNER / 100, rel=1e-6)  # float32
     assert not coloured or (cloud.colours == COLOURS).all()
-    assert f"relit import scans {folder}" in relit.done("import", "guess", folder).out
+    assert f"relit import scans {folder} SCAN_SET" in relit.done("import", "guess", folder).out
     assert "are converted" in relit.refused("import", "scans", folder)
 
 
@@ -92,7 +92,7 @@ def write_e57(path, *scans):
 
 def test_scanners_of_e57_files_keep_their_places(relit, tmp_path, folder):
     write_e57(folder / "hall.e57", (CORNER, [1.0, 0, 0, 0], [0.0, 0, 0]), (CORNER + 1, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], [5.0, 6, 7]))
-    assert f"relit import scans {folder}" in relit.done("import", "guess", folder).out
+    assert f"relit import scans {folder} SCAN_SET" in relit.done("import", "guess", folder).out
     said = relit.done("import", "scans", folder, tmp_path / "set").out
     assert "as the files say" in said and "2 from their files" in said
     first, second = json.loads((tmp_path / "set" / "scan-set.json").read_text())["scans"]
