@@ -38,7 +38,7 @@ class AcquireRequest(ReviewOptions, DeviceRequest):
 
     plan: Annotated[Line, Role.INPUT, Spelling(argument=True, metavar="PLAN")]
     """What is captured: a plan.json (relit.plan/1), or names with commas between, such as dark,olat: olat, gradients, polarised, dark,
-    flat, chart, mirror-ball, grey-ball, or a code of relit patterns."""
+    flat, chart, mirror-ball, grey-ball, projector-response, or a code of relit patterns."""
     camera: Annotated[Line, Spelling(metavar="CAMERA")]
     """The camera: watch:FOLDER or watch:FOLDER/*.jpg for the files that a tethering program writes, gphoto2 or gphoto2:PORT for a camera at
     a USB port, aravis or aravis:NAME for a machine-vision camera, video:0 for a video device."""

@@ -63,7 +63,7 @@ class EncodingOptions(Options):
     """The encoding of images."""
 
     color_space: ColorSpaceName | None = None
-    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
+    """Colour space of the images; None: what the files declare, else sRGB for 8-bit images and scene-linear for others."""
 
 
 class ImageOptions(EncodingOptions):

@@ -156,7 +156,7 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
     gray_images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the images of a Gray code that numbers the periods."""
     gray_stripe: Positive | None = None
-    """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
+    """Width of the finest stripe of the Gray code in projector pixels: a period or less; half a period or less without inverses."""
     gray_inverses: Inverses = Inverses.NONE
     """The place of the inverse images of the Gray code."""
     gray_fine_first: bool = False
