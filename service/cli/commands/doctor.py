@@ -65,7 +65,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
     faults += _service(data, config)
     for fault in faults:
         print(f"{'wrong':<12} {fault}")
-    print("sound" if not faults else f"{len(faults)} faults")
+    print("sound" if not faults else f"faults: {len(faults)}")
     if faults:
         raise typer.Exit(1)
 

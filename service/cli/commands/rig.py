@@ -63,7 +63,7 @@ def _plan(found: Any, request: requests.RigPlanRequest) -> None:
     print_lines(table=request.out / "plan.csv", plot=request.out / "plan.png")
     rows, doubts = found
     for row in rows:
-        highlights = ", ".join(f"{100 * error:.2g}" for error in row.highlights)
+        highlights = ", ".join(f"{100 * error:.{1 if error < 0.1 else 0}f}" for error in row.highlights)
         of = f" of {row.rig}" if row.rig else ""
         print(f"{row.lights:>6} lamps{of} under {row.environment}: irradiance {100 * row.irradiance:.2g} %, highlights {highlights} %")
     print_warnings(doubts)
