@@ -66,6 +66,9 @@ def explanation_sentence(found: Explanation, sample: Sample) -> str:
         return (f"frames[].light: from {first} on, the images look one light {'ahead of' if ahead else 'behind'} the manifest, as where a "
                 f"picture was {'lost' if ahead else 'taken twice'}: with each light one image {'earlier' if ahead else 'later'} there, "
                 f"{fits}; check which light belongs to which image from there on")
+    if found.gloss:
+        return (f"color_space: the images look linear, and {sample.color_space} is declared, or a broad highlight lies over the object: "
+                f"nothing tells them apart under lights so near to where it faces (taken as linear, {fits}); check color_space")
     return {
         Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as "
                        f"{ENCODINGS.get(found.space)}, {fits}; declare {found.space} if they are",

@@ -27,7 +27,7 @@ from service.light_estimation.lambertian import (
 )
 from service.light_estimation.neighbours import IN_ORDER, MIN_LIGHTS_SMOOTH, SMOOTH, in_order
 from service.light_estimation.other_directions import from_ball_normals, from_other_elevations
-from service.light_estimation.semi_calibrated import ROUND, TINY, fit_intensities, told_by_relief
+from service.light_estimation.semi_calibrated import ROUND, TINY, fit_intensities, flat_in_frontal_light, told_by_relief
 from service.light_estimation.steady_light import fit_steady_light
 from stage.colour.colour import GREY_WEIGHTS
 from stage.colour.colour_spaces import is_linear
@@ -115,6 +115,7 @@ class Explanation(NamedTuple):
     part: float = 0.0
     """Median of the light that all images share, over that of a lamp which a pixel faces."""
     normal: np.ndarray | None = None  # [3, pixels] of the sample without that light
+    gloss: bool = False  # whether a highlight of the object explains the images as well
 
 
 class Sample(NamedTuple):
@@ -189,7 +190,8 @@ def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
     for space, radiance in other_readings(sample.radiance, sample.exposure[:, None, None], sample.color_space):
         fit = fit_manifest(sample._replace(radiance=radiance))
         if _explains(fit.misfit(), misfit, TIMES if linear else TIMES_FREE):
-            found.append(Explanation(Cause.ENCODED if linear else Cause.LINEAR, misfit, fit.misfit(), _angle(given, fit), space=space))
+            found.append(Explanation(Cause.ENCODED if linear else Cause.LINEAR, misfit, fit.misfit(), _angle(given, fit), space=space,
+                                     gloss=not linear and flat_in_frontal_light(given, sample.directions)))
     if not found:
         return None
     best = min(found, key=lambda one: one.left)

@@ -236,3 +236,19 @@ def test_a_highlight_of_a_wall_is_no_wrong_light_and_one_light_of_another_streng
     assert suspects(readings, lights, normal) == []
     readings[5] *= factor
     assert [found.light for found in suspects(readings, lights, normal)] == [5]
+
+
+@pytest.mark.parametrize(("farthest_deg", "told"), [(33, "a broad highlight lies over the object"), (60, None)])
+def test_gloss_of_a_relief_under_frontal_lights_is_not_called_an_encoding(farthest_deg, told):
+    """A tablet of varnish in images that are encoded as declared: its highlight falls off as shading does that is decoded once too often.
+    Lights from farther aside, of which the highlight shows little, contradict that."""
+    draw = np.random.default_rng(2)
+    lights = fibonacci_sphere(400)
+    lights = lights[lights[:, 2] > np.cos(np.radians(farthest_deg))]
+    lights = lights[np.linspace(0, len(lights) - 1, 8).round().astype(int)]
+    tablet = unit(np.array([0, 0, 1.0]) + 0.04 * draw.normal(size=(600, 3)))
+    gloss = np.stack([specular(tablet, light, VIEW, 0.25, 0.04) for light in lights])
+    readings = draw.uniform(0.1, 0.6, 600) / np.pi * np.maximum(lights @ tablet.T, 0) + gloss
+    sample = sample_of(readings / readings.max(), lights)._replace(color_space="srgb_texture")
+    found = better_explanation(sample, fit_manifest(sample))
+    assert (found is None) == (told is None) and (told is None or told in explanation_sentence(found, sample))
