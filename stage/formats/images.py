@@ -204,7 +204,8 @@ def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarra
     """Read the values of a mask: the first channel of an image, where partial values stand for pixels that the object covers in part.
     Returns [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0."""
     check_resolution(path, resolution)
-    values = read_pixels(path)[..., 0].astype(np.float32)
+    recorded = read_recorded(path)[..., 0]
+    values = np.take(fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded.astype(np.float32)
     return np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
 
 
