@@ -9,6 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from service.reporting.progress import Progress, Timings
 from service.requests.base.base import Role
 from service.requests.base.import_choices import ImportChoices
 from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
@@ -33,6 +34,8 @@ from stage.errors import ManifestError, StageError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
 from stage.importers.video import is_video
+from stage.stack.correction import Correction
+from stage.stack.peaks import MOST_FRAMES
 from stage.stack.readings import said_by_readings
 
 if TYPE_CHECKING:
@@ -41,19 +44,24 @@ if TYPE_CHECKING:
     from stage.importers.raw_arrays import ArrayFiles
 
 
-def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Imported:
+def import_files(request: ImportRequest, progress: Progress | None = None, *, assumed: tuple[str, ...] = ()) -> Imported:
     """Write the capture.json of a request, and return where it is and how the files were understood.
     `assumed`: what was taken for granted by who chose the layout, which the manifest then records. Raises ManifestError if the files do not
     hold what the layout has, or do not fit the options."""
+    timings = Timings(progress)
+    timings.stage("import", 1)
     imported = _IMPORTS[type(request)](request)
     manifest = read_manifest(imported.path)
     doubts, seen, faults = manifest.assumed, list[str](), list[tuple[str, str]]()
+    timings.stage("readings", MOST_FRAMES)
     try:
         capture = Capture.open(imported.path)
         doubts = capture.doubts
-        seen = said_by_readings(capture)
+        Correction.of(capture)  # raises where dark, flat or ambient frames cannot be
+        seen = said_by_readings(capture, advance=timings.advance)
     except StageError as error:  # of an image, which the import need not have looked at
         faults = [("fault", str(error))]
+    timings.advance(MOST_FRAMES)
     said = [("assumed" if doubt in manifest.assumed else "finding", doubt) for doubt in (*doubts, *seen) if doubt not in assumed]
     more = tuple(sentence for sentence in (*assumed, *seen) if sentence not in manifest.assumed)
     if more:
@@ -257,7 +265,7 @@ def import_chosen(folder: Path, choices: ImportChoices, assumed: tuple[str, ...]
     known = options_of_layout(choices.layout)
     options = {key: folder / value if key in known and known[key].role is Role.INPUT and isinstance(value, str) else value
                for key, value in choices.options.items()}
-    path = import_files(request_of(choices.layout, folder / (choices.file or ""), folder, options), assumed).path
+    path = import_files(request_of(choices.layout, folder / (choices.file or ""), folder, options), assumed=assumed).path
     write_manifest(read_manifest(path).model_copy(update={"name": name}), path)
 
 

@@ -31,7 +31,8 @@ from stage.colour.radiance import clipping_sentences
 from stage.errors import StageError, StorageError
 from stage.formats import images
 from stage.formats.exif import TURNS, UPRIGHT
-from stage.stack.correction import Correction, saturation_limit
+from stage.stack.correction import Correction, any_from, saturation_limit
+from stage.stack.peaks import Peaks
 from stage.stack.readings import said_by_readings
 from stage.tof.raw_frames import check_frames, read_frame
 from stage.transforms import fibonacci_sphere
@@ -86,8 +87,9 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     levels = []
     looked = pixels_to_look_at(capture)
     positions = None if looked is None else looked.chosen
+    peaks = Peaks(capture)
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
-        for level in pool.map(lambda frame: _level(capture, frame, positions), frames):
+        for level in pool.map(lambda frame: _level(capture, frame, positions, peaks), frames):
             levels.append(level)
             timings.advance(len(levels))
     faults = [level.fault for level in levels if level.fault is not None]
@@ -116,7 +118,7 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         found = findings(capture, looked, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
                                            if level.picked is not None})
     looks = [*capture.doubts, *found.sentences]
-    looks += [] if faults else said_by_readings(capture)
+    looks += [] if faults else said_by_readings(capture, peaks)
     if request.picture is not None:
         peak = max((level.peak for level in read), default=1.0)
         facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, request.review, timings)))
@@ -221,25 +223,31 @@ def _kind(frame: Frame) -> str:
     return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
 
 
-def _level(capture: Capture, frame: Frame, positions: np.ndarray | None) -> _FrameLevel:
+def _level(capture: Capture, frame: Frame, positions: np.ndarray | None, peaks: Peaks) -> _FrameLevel:
     """Return the lowest and the brightest value and the saturated readings of one frame, or its fault."""
-    path = capture.file(frame.image)
     try:
         if frame.tof is not None:
-            pixels = read_frame(capture, frame)[..., None]
-        else:
-            recorded = capture.recorded(frame.image)
-            pixels = np.take(images.fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
+            return _level_of_times(capture, frame)
+        recorded = capture.recorded(frame.image, keep_half=True)
     except StageError as error:
         return _FrameLevel(0.0, 0.0, 0, str(error))
+    peaks.note(frame.image, recorded)
     limit = capture.manifest.saturation
-    saturated = 0 if limit is None else int((pixels >= limit).any(axis=-1).sum())
+    saturated = 0 if limit is None else int(any_from(limit, recorded).sum())
+    some = recorded[np.unravel_index(np.zeros(0, int) if positions is None else positions, recorded.shape[:2])]
+    lowest, peak, picked = (images.fractions(recorded.dtype)[values] if recorded.dtype.kind == "u" else values.astype(np.float32)
+                            for values in (recorded.min(), recorded.max(), some))
+    return _FrameLevel(float(lowest), float(peak), saturated, None, None if positions is None else picked)
+
+
+def _level_of_times(capture: Capture, frame: Frame) -> _FrameLevel:
+    """Return the same of a time-of-flight frame, some of whose readings need not be finite."""
+    pixels, limit = read_frame(capture, frame), capture.manifest.saturation
     finite = np.isfinite(pixels)
     if not finite.any():
-        return _FrameLevel(0.0, 0.0, 0, f"{path}: no reading is finite")
-    lowest, peak = float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf))
-    picked = pixels.reshape(-1, pixels.shape[-1])[positions] if positions is not None and frame.tof is None else None
-    return _FrameLevel(lowest, peak, saturated, None, picked, int(finite.size - finite.sum()))
+        return _FrameLevel(0.0, 0.0, 0, f"{capture.file(frame.image)}: no reading is finite")
+    return _FrameLevel(float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf)),
+                       0 if limit is None else int((pixels >= limit).sum()), None, None, int(finite.size - finite.sum()))
 
 
 class FrontLights(NamedTuple):

@@ -25,6 +25,7 @@ from stage.errors import ManifestError
 from stage.motion.tracking import tracking_frames
 from stage.stack.brackets import chosen_frames, merge_brackets, one_frame_a_light
 from stage.stack.ingest import open_stack
+from stage.stack.peaks import Peaks
 from stage.stack.readings import said_by_readings
 from stage.stack.stack import Stack
 
@@ -97,11 +98,12 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
-    if over_time is None:  # else twelve images of each step would be read twice
-        capture = replace(capture, doubts=(*capture.doubts, *said_by_readings(capture)))
     pairs = None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    if over_time is None:
+        (peaks := Peaks(capture)).recall(stack.peaks)
+        capture = replace(capture, doubts=(*capture.doubts, *said_by_readings(capture, peaks)))
     if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
         if capture.is_polarised:
             from service.solve.methods.polarised import separate_pairs

@@ -1,5 +1,6 @@
 """Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, colours, exposure and ambient light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -60,6 +61,8 @@ class Correction:
     ambient: np.ndarray | None  # [rows, cols, 3] float32, mean of the `off` frames, corrected but for their colours
     full_scale: bool = False
     """True to mark the largest value of integers as saturated where the capture gives no `saturation`."""
+    note: Callable[[str, np.ndarray], None] | None = None
+    """Called with the image and the recorded values, [rows, cols, 3], of every frame that is read."""
 
     @classmethod
     def of(cls, capture: Capture, *, full_scale: bool = False) -> "Correction":
@@ -100,13 +103,15 @@ class Correction:
         """Read one frame and correct it, and leave integers and half values as they are where `has_codes`."""
         manifest = self.capture.manifest
         recorded = self.capture.recorded(frame.image, keep_half=True)
+        if self.note is not None:
+            self.note(frame.image, recorded)
         saturated: np.ndarray | None = None
         limit = manifest.saturation
         if limit is None and self.full_scale:
             integer = recorded.dtype.kind == "u" or images.read_header(self.capture.file(frame.image)).integer  # 32 bits are read as float
             limit = FULL_SCALE if integer else None
         if limit is not None:
-            saturated = _any_from(limit, recorded)
+            saturated = any_from(limit, recorded)
         if self._is_pointwise(frame) and (recorded.dtype.kind == "u" or (recorded.dtype == np.float16 and is_linear(manifest.color_space))):
             codes = recorded if recorded.dtype.kind == "u" else recorded.view(np.uint16)
             every = np.arange(np.iinfo(codes.dtype).max + 1, dtype=codes.dtype)
@@ -186,7 +191,7 @@ class Correction:
         return frame.color_matrix or self.capture.manifest.color_matrix
 
 
-def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
+def any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
     """Return whether any channel of a pixel is at or above a limit.
     `limit`: a fraction of full scale, or a floating-point value. `recorded`: [rows, cols, 3] uint8, uint16, float16 or float32. Returns
     [rows, cols] bool."""

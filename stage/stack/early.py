@@ -4,6 +4,7 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from stage.capture.capture import Capture
 from stage.capture.manifest import Frame
@@ -11,6 +12,7 @@ from stage.errors import StorageError, storage
 from stage.stack.correction import Correction
 from stage.stack.fingerprint import Fingerprints
 from stage.stack.ingest import FINGERPRINTS, Ingest, stack_key
+from stage.stack.peaks import Peaks
 from stage.stack.stack_file import StackFile
 
 EARLY = ".early.npy"
@@ -29,6 +31,7 @@ class EarlyStack:
         self._fingerprints: Fingerprints | None = None
         self._correction: tuple[str, Correction] | None = None
         self._keys: dict[int, str] = {}
+        self._peaks: Peaks | None = None
 
     def add(self, capture: Capture, frame: Frame, light: int) -> None:
         """Decode an image; where it, or a dark, flat or ambient frame, is another one later, it is decoded anew in the end.
@@ -39,7 +42,8 @@ class EarlyStack:
         file = self._file or self._begin(capture, frame)
         common, key = (stack_key(capture, frames, None, fingerprints) for frames in ([], [frame]))
         if self._correction is None or self._correction[0] != common:
-            self._correction = common, Correction.of(capture, full_scale=True)
+            self._peaks = self._peaks or Peaks(capture)
+            self._correction = common, replace(Correction.of(capture, full_scale=True), note=self._peaks.note)
         radiance = replace(self._correction[1], capture=capture).coded(frame)
         with storage("write", self._path):
             file.write(light, radiance)
@@ -51,15 +55,16 @@ class EarlyStack:
         if self._fingerprints is not None:
             self._fingerprints.remember()
 
-    def take(self, ingest: Ingest, path: Path) -> tuple[StackFile, set[int]] | None:
-        """Move the file to a path, and return it with the lights whose planes are those of the frames; None where it is of no use."""
+    def take(self, ingest: Ingest, path: Path) -> tuple[StackFile, set[int], dict[str, Any]] | None:
+        """Move the file to a path, and return it with the lights whose planes are those of the frames, and with the kept peaks; None where
+        it is of no use."""
         if self._file is None or (self._lights, self._resolution) != (len(ingest.frames), ingest.capture.camera.resolution):
             return None
         there = {light for light, frame in enumerate(ingest.frames)
                  if self._keys.get(light) == stack_key(ingest.capture, [frame], None, ingest.fingerprints)}
         os.replace(self._path, path)
         file, self._file = self._file, None
-        return file, there
+        return file, there, {} if self._peaks is None else self._peaks.kept()
 
     def close(self) -> None:
         """Remove the file, unless it has become that of a stack."""

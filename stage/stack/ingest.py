@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -27,6 +27,7 @@ from stage.motion.tracking import Interval, Tracking, intervals
 from stage.stack import stack as stacks
 from stage.stack.correction import Correction, Radiance
 from stage.stack.fingerprint import Fingerprints
+from stage.stack.peaks import Peaks
 from stage.stack.stack import Stack
 from stage.stack.stack_file import StackFile
 
@@ -147,8 +148,9 @@ FrameProgress = Callable[[int, int], None]
 class Begun(Protocol):
     """A stack that was begun before all its images were there; stage.stack.early has it."""
 
-    def take(self, ingest: "Ingest", path: Path) -> tuple[StackFile, set[int]] | None:
-        """Move the file to a path, and return it with the lights whose planes are those of the frames; None where it is of no use."""
+    def take(self, ingest: "Ingest", path: Path) -> tuple[StackFile, set[int], dict[str, Any]] | None:
+        """Move the file to a path, and return it with the lights whose planes are those of the frames, and with the kept peaks; None where
+        it is of no use."""
 
 
 @dataclass(frozen=True)
@@ -252,18 +254,18 @@ def _build(ingest: Ingest, alignment: Alignment | None, early: Begun | None, pro
         begun = None if early is None else early.take(ingest, temporary)
         if begun is None:
             with storage("make the stack cache", stacks.values_path(folder, key)):
-                begun = StackFile(temporary, len(frames), pixel_count), set()
-        file, there = begun
+                begun = StackFile(temporary, len(frames), pixel_count), set(), {}
+        file, there, noted = begun
+        (peaks := Peaks(capture)).recall(noted)
         with closing(file):
-            _write(file, capture, frames, alignment, there, progress)
+            _write(file, replace(Correction.of(capture, full_scale=True), note=peaks.note), frames, alignment, there, progress)
     motion = None if alignment is None else alignment.statistics()
-    return _complete(capture, frames, folder, key, file, motion)
+    return _complete(capture, frames, folder, key, file, motion, peaks.kept())
 
 
-def _write(file: StackFile, capture: Capture, frames: list[Frame], alignment: Alignment | None, there: Collection[int],
+def _write(file: StackFile, correction: Correction, frames: list[Frame], alignment: Alignment | None, there: Collection[int],
            progress: FrameProgress | None) -> None:
     """Decode the frames whose planes are not there yet."""
-    correction = Correction.of(capture, full_scale=True)
     lock, done = threading.Lock(), len(there)
 
     def take(light: int, warp: Warp | None) -> None:
@@ -280,7 +282,7 @@ def _write(file: StackFile, capture: Capture, frames: list[Frame], alignment: Al
     bytes_per_pixel = ALIGNED_BYTES_PER_PIXEL
     if alignment is None:
         bytes_per_pixel = CODED_BYTES_PER_PIXEL if correction.has_codes(frames[0]) else BYTES_PER_PIXEL
-    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
+    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(correction.capture.image_resolution))))
     with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
         try:
             for batch, warp in batches:
@@ -291,10 +293,12 @@ def _write(file: StackFile, capture: Capture, frames: list[Frame], alignment: Al
             raise
 
 
-def _complete(capture: Capture, frames: list[Frame], folder: Path, key: str, file: StackFile, motion: dict[str, Any] | None) -> Stack:
+def _complete(capture: Capture, frames: list[Frame], folder: Path, key: str, file: StackFile, motion: dict[str, Any] | None,
+              peaks: dict[str, Any]) -> Stack:
     """Write the saturation bits and the index of a stack whose values are in place."""
     pixel_count = capture.camera.width * capture.camera.height
-    built = Stack(folder, key, tuple(frame.image for frame in frames), file.scale, pixel_count, motion, clipped=dict(capture.clipped))
+    built = Stack(folder, key, tuple(frame.image for frame in frames), file.scale, pixel_count, motion, clipped=dict(capture.clipped),
+                  peaks=peaks)
     marked = bool(file.saturated.any())
     try:
         if marked:

@@ -57,6 +57,8 @@ class Stack:
     """The statistics of an aligned stack for the report, or None."""
     clipped: dict[str, int] = field(default_factory=dict, kw_only=True)
     """The number of pixels in which values below the noise were set to 0, by the names of the images that had any."""
+    peaks: dict[str, Any] = field(default_factory=dict, kw_only=True)
+    """The highest readings of some frames, as `stage.stack.peaks` keeps them."""
 
     @property
     def light_count(self) -> int:
@@ -157,7 +159,7 @@ def find(folder: Path, key: str) -> Stack | None:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
         checksum = index.pop("checksum")
         found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
-                      index.get("motion"), clipped=index.get("clipped", {}))
+                      index.get("motion"), clipped=index.get("clipped", {}), peaks=index.get("peaks", {}))
         saturated = index["checksums"]["saturated"]
         bits = saturated_path(folder, key)
         sound = (checksum == _checksum(index)
@@ -177,7 +179,8 @@ def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> N
     `values`: the checksums of its planes, in the order of channels and padded lights. `saturated`: the checksum of the saturation bits, or
     None where there are none."""
     index = {"frames": stack.frames, "scale": [float(scale) for scale in stack.scale], "pixel_count": stack.pixel_count,
-             "motion": stack.motion, "clipped": stack.clipped, "checksums": {"values": list(values), "saturated": saturated}}
+             "motion": stack.motion, "clipped": stack.clipped, "peaks": stack.peaks,
+             "checksums": {"values": list(values), "saturated": saturated}}
     write_text(index_path(stack.folder, stack.key), json.dumps(index | {"checksum": _checksum(index)}))
 
 

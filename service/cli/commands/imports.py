@@ -81,7 +81,7 @@ def _auto(folder: Path, destination: Path | None, *, kept: bool = True) -> list[
         target = destination if destination is None or len(guesses) == 1 else destination / found.source.name
         _print_guess(found)
         typed = taken_apart(found.arguments)
-        imported = import_files(request_of(typed.layout, typed.source, target, typed.options), found.assumed)
+        imported = import_files(request_of(typed.layout, typed.source, target, typed.options), assumed=found.assumed)
         if kept:
             _print("capture", imported)
             print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")

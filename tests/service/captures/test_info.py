@@ -176,3 +176,12 @@ def test_a_dark_image_is_taken_off_first(tmp_path):
     """A pedestal that hides the shadows, in the images and in the dark image."""
     write_exr(tmp_path / "dark.exr", np.full((*EXPLAINED.mask.shape, 3), 0.2))
     assert findings(tmp_path, 0.2 + 0.8 * SCALED, dark="dark.exr") == []
+
+
+@pytest.mark.parametrize("command", ["info", "solve"])
+def test_every_image_is_decoded_once(relit, tmp_path, monkeypatch, command):
+    write_capture(tmp_path / "capture", SCENE)
+    names, recorded = [], Capture.recorded
+    monkeypatch.setattr(Capture, "recorded", lambda self, name, **more: names.append(name) or recorded(self, name, **more))
+    relit(command, tmp_path / "capture", *(("--out", tmp_path) if command == "solve" else ()))
+    assert sorted(names) == [frame.image for frame in Capture.open(tmp_path / "capture").manifest.frames]

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from stage.capture.capture import Capture
+from stage.stack.ingest import open_stack
+from stage.stack.peaks import Peaks
 from stage.stack.readings import said_by_readings
 from tests.scenes.captures import make_scene, manifest_of, write_image, write_manifest
 
@@ -69,3 +71,35 @@ def test_a_mask_in_alpha_is_said(tmp_path):
         layers = [*[np.where(colour, 255, 0)] * 3, np.where(SCENE.mask, 255, 0)]
         write_image(tmp_path / "mask.png", np.stack(layers, axis=-1).astype(np.uint8))
         assert [said.startswith("mask: it is white everywhere") for said in said_by_readings(found)] == [True] * told
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """The images that are decoded for what is said."""
+    names, recorded = [], Capture.recorded
+    monkeypatch.setattr(Capture, "recorded", lambda self, name, **more: names.append(name) or recorded(self, name, **more))
+    return names
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_a_stack_says_what_its_ingest_has_seen(tmp_path, decoded, dtype):
+    """When it is made and from the cache, and no longer where another mask has other pixels."""
+    found = capture(tmp_path, np.minimum(1.2 * SHINING, 1), dtype=dtype, full=4095 if dtype == np.uint16 else 1)
+    wanted = said_by_readings(found)
+    assert len(wanted) == 1
+    for again in (False, True):
+        decoded.clear()
+        stack = open_stack(found)
+        assert len(decoded) == (0 if again else 12)
+        (peaks := Peaks(found)).recall(stack.peaks)
+        decoded.clear()
+        assert said_by_readings(found, peaks) == wanted and not decoded
+    write_image(tmp_path / "mask.png", np.where(np.roll(SCENE.mask, 1, axis=1), 255, 0).astype(np.uint8))
+    (peaks := Peaks(found)).recall(stack.peaks)
+    assert not peaks.found
+
+
+@pytest.mark.parametrize(("level", "count"), [(0.6, 6), (1.5, 1), (0.2, 12)])
+def test_few_images_are_decoded_where_nothing_is_to_say(tmp_path, decoded, level, count):
+    """One of full scale shows that nothing is clipped below it; all are looked at where none is above the range of fourteen bits."""
+    assert not said_by_readings(capture(tmp_path, level * SHINING / SHINING.max())) and len(decoded) == count
