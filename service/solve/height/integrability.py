@@ -66,12 +66,14 @@ def beside_parts(sigma: np.ndarray, part: np.ndarray) -> np.ndarray:
 def misfit(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the mean angle, in degrees, from normals to those of the surface around each pixel, [rows, cols] float32; 0 where too few
     neighbours are solved to say. Parameters are as for `doubt`."""
-    found, reach = np.empty(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
+    found, reach = np.zeros(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
     step = max(1, BAND_PIXELS // height.shape[1])
 
     def judge(first: int) -> None:
         above = max(first - reach, 0)
         band = slice(above, first + step + reach)
+        if not part[band].any():
+            return
         points, sight = (camera.points(z, above).astype(np.float64) for z in (height[band], np.ones_like(height[band])))
         if camera.projection == "orthographic":
             sight[..., :2] = 0

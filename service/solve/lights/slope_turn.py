@@ -109,21 +109,31 @@ def turn_by_slopes(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: N
 
 
 def _looked_at(normal: np.ndarray, mask: np.ndarray, camera: Camera, near: Nearness | None) -> _Plane | None:
-    """Return every n-th pixel in both directions; None where no box has room."""
+    """Return every n-th pixel in both directions, of the rectangle around the object; None where no box has room."""
     step = max(1, round(np.sqrt(np.count_nonzero(mask)) / MOST_ACROSS))
     row, col = np.arange(0, mask.shape[0], step), np.arange(0, mask.shape[1], step)
-    x, y = camera.plane_at(*np.meshgrid(col + 0.5, row + 0.5))
     inside = mask[::step, ::step]
     width = max(LEAST_WIDTH, round(np.sqrt(np.count_nonzero(inside)) / BOXES))
     if min(inside.shape) <= width:
         return None
+    x, y = camera.plane_at(*np.meshgrid(col[:2] + 0.5, row[:2] + 0.5))
     least = SUREST * float(np.hypot(x[0, 1] - x[0, 0], y[1, 0] - y[0, 0])) * np.sqrt(width)
-    normal, perspective = normal.reshape(3, *mask.shape)[:, ::step, ::step].astype(np.float64), camera.projection == "perspective"
+    rows, cols = (_span(np.any(inside, axis=axis), width) for axis in (1, 0))
+    row, col, inside = row[rows], col[cols], inside[rows, cols]
+    x, y = camera.plane_at(*np.meshgrid(col + 0.5, row + 0.5))
+    normal = normal.reshape(3, *mask.shape)[:, ::step, ::step][:, rows, cols].astype(np.float64)
+    perspective = camera.projection == "perspective"
     sway = np.zeros((3, 1, 1))
     if near is not None:
         pixels = (row[:, None] * mask.shape[1] + col).reshape(-1)
         sway = near.closeness * (camera.points_at(pixels, near.height.reshape(-1)[pixels]) - near.centre).T.reshape(3, *x.shape)
     return _Plane(normal, sway, inside, x, y, perspective, width, least)
+
+
+def _span(seen: np.ndarray, width: int) -> slice:
+    """Return where something is seen, from one place before it on, and from the border of a box of the whole image."""
+    places = np.flatnonzero(seen)
+    return slice(max(0, (places[0] - 1) // width * width), places[-1] + 1) if len(places) else slice(0)
 
 
 def _fit(plane: _Plane, turn: Rotation, changes: np.ndarray) -> _Fit | None:
