@@ -37,6 +37,8 @@ SLIVER_PIXELS = 3.0
 """Mean width of a fragment below which it may be one of mixed pixels along an outline: twice its pixels over its cut edges."""
 SURROUNDED = 0.8
 """Part of the outline of a strip that one neighbour has where it does not lie between two parts: a wire, or a groove."""
+ALL = slice(None)
+"""All edges."""
 ROUNDS = 8
 """Most rounds in which small fragments join their neighbours; each at least halves a chain of them."""
 
@@ -101,13 +103,13 @@ class _Seam:
         self.shift = np.zeros(found.count)  # added to the heights of each fragment
         self.size = sizes_of(found.label, found.count)
 
-    def sides(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the groups on both sides of each edge."""
-        return self.group[self.ends[0]], self.group[self.ends[1]]
+    def sides(self, edges: np.ndarray | slice = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Return the groups on both sides of edges."""
+        return self.group[self.ends[0][edges]], self.group[self.ends[1][edges]]
 
-    def rest(self) -> np.ndarray:
-        """Return how far the second side of each edge lies in front of where the first leads."""
-        return self.step + self.shift[self.ends[1]] - self.shift[self.ends[0]]
+    def rest(self, edges: np.ndarray) -> np.ndarray:
+        """Return how far the second side of edges lies in front of where the first leads."""
+        return self.step[edges] + self.shift[self.ends[1][edges]] - self.shift[self.ends[0][edges]]
 
     def pairs(self) -> np.ndarray:
         """Return [n, 2] groups that share edges, those with the most edges first."""
@@ -161,7 +163,7 @@ def _absorb(seam: _Seam, little: np.ndarray) -> bool:
     edges = edges[np.append(small[edges][1:] != small[edges][:-1], True)]  # and of their common edges the likest
     into, added = np.arange(len(seam.size)), np.zeros(len(seam.size))
     into[small[edges]] = large[edges]
-    added[small[edges]] = np.where(upward[edges], 1, -1) * seam.rest()[edges]
+    added[small[edges]] = np.where(upward[edges], 1, -1) * seam.rest(edges)
     seam.move(into, added)
     return True
 
@@ -190,7 +192,7 @@ def _met(seam: _Seam, low: int, edges: np.ndarray, play: np.ndarray) -> tuple[in
     telling = edges[~found.edge_on[edges] | (found.unlike & ~found.turned)[edges]]  # an inlay near a rim goes on as the surface does
     if len(telling) <= MEETING * len(edges):
         return 0, 0.0
-    needed = np.where(seam.sides()[0][telling] == low, 1, -1) * seam.rest()[telling]
+    needed = np.where(seam.sides(telling)[0] == low, 1, -1) * seam.rest(telling)
     reach = play[telling] + DRIFT * len(edges)
     bounds = np.concatenate([needed - reach, needed + reach])
     order = np.argsort(bounds, kind="stable")
