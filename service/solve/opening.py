@@ -24,7 +24,7 @@ from stage.capture.point_lights import DistantLights, PlacedLights, distance_is_
 from stage.errors import ManifestError
 from stage.motion.tracking import tracking_frames
 from stage.stack.brackets import chosen_frames, merge_brackets, one_frame_a_light
-from stage.stack.ingest import open_stack
+from stage.stack.ingest import Ingest, open_stack
 from stage.stack.peaks import Peaks
 from stage.stack.readings import said_by_readings
 from stage.stack.stack import Stack
@@ -99,8 +99,10 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
     pairs = None
+    timings.stage("files", 100)
+    ingest = Ingest.of(capture, cache=request.cache, tracking=tracking, progress=timings.advance_percent)
     timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    stack = ingest.stack(lambda done, _: timings.advance(done))
     if over_time is None:
         (peaks := Peaks(capture)).recall(stack.peaks)
         capture = replace(capture, doubts=(*capture.doubts, *said_by_readings(capture, peaks)))

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,10 +18,12 @@ BLOCK = 1 << 20
 class Fingerprints:
     """The content hashes of the files of one folder, which are kept in a JSON file between runs."""
 
-    def __init__(self, folder: Path, memory: Path) -> None:
-        """Load the hashes that an earlier run has kept."""
+    def __init__(self, folder: Path, memory: Path, progress: Callable[[float], None] | None = None) -> None:
+        """Load the hashes that an earlier run has kept.
+        `progress`: called with the fraction of the files of each call of `of` that are done."""
         self._folder = folder
         self._memory = memory
+        self._progress = progress
         self._known: dict[str, list[int | str]] = {}
         try:
             remembered = json.loads(memory.read_text(encoding="utf-8"))
@@ -33,7 +35,12 @@ class Fingerprints:
         """Return the content hash of each file by its name."""
         wanted = list(dict.fromkeys(names))
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-fingerprints") as pool:
-            return dict(zip(wanted, pool.map(self._of, wanted), strict=True))
+            found = {}
+            for name, known in zip(wanted, pool.map(self._of, wanted), strict=True):
+                found[name] = known
+                if self._progress is not None:
+                    self._progress(len(found) / len(wanted))
+            return found
 
     def _of(self, name: str) -> str:
         path = self._folder / name

@@ -169,16 +169,17 @@ class Ingest:
     """The key of the stack: a hash of everything that the stored values depend on."""
 
     @classmethod
-    def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None) -> "Ingest":
+    def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
+           progress: Callable[[float], None] | None = None) -> "Ingest":
         """Hash the images of the light frames of a capture.
         `cache`: the folder for the cache; None stands for `.relit` in the folder of the capture. `tracking`: tracking frames, to the
-        reference of which every frame is warped; None leaves the frames as recorded. Raises ManifestError if no light lit any frame of the
-        capture."""
+        reference of which every frame is warped; None leaves the frames as recorded. `progress`: called with the fraction of the files that
+        are hashed. Raises ManifestError if no light lit any frame of the capture."""
         frames = capture.sources()
         if not frames:
             raise ManifestError(capture.none_is_lit("a distant, point, extended or gradient light"))
         folder = cache if cache is not None else capture.folder / CACHE_FOLDER
-        fingerprints = Fingerprints(capture.folder, folder / FINGERPRINTS)
+        fingerprints = Fingerprints(capture.folder, folder / FINGERPRINTS, progress)
         hint = "" if cache is not None else " (--cache names another folder for it)"
         return cls(capture, frames, tracking, folder, hint, fingerprints, stack_key(capture, frames, tracking, fingerprints))
 

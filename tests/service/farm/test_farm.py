@@ -196,8 +196,8 @@ def test_progress_lines_of_a_solve_count_each_stage(relit, tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=8, lights=4))
     lines = relit("solve", tmp_path / "cap", "--progress", "openjd", "--out", tmp_path / "maps").out.splitlines()
     stages = [line.removeprefix("openjd_status: ") for line in lines if "status" in line]
-    assert stages[:2] == ["open", "ingest"] and stages[-1] == "write"
-    ingest = lines[lines.index("openjd_status: ingest") + 1 : lines.index(f"openjd_status: {stages[2]}")]
+    assert stages[:3] == ["open", "files", "ingest"] and stages[-1] == "write"
+    ingest = lines[lines.index("openjd_status: ingest") + 1 : lines.index(f"openjd_status: {stages[3]}")]
     assert "openjd_progress: 25" in ingest and "openjd_progress: 100" in lines
 
 
