@@ -283,10 +283,11 @@ def _count_above_one(solution: Solution, solved: np.ndarray) -> int:
     """Return the number of solved pixels whose albedo is above 1 by more than SURELY_ABOVE of its standard errors."""
     if solution.albedo is None:
         return 0
-    least, sigma, pixels = solution.albedo, solution.albedo_sigma(), solved.reshape(-1)
+    pixels = np.flatnonzero(solved)
+    least, sigma = solution.albedo[:, pixels], solution.albedo_sigma(pixels)
     if sigma is not None:
         least = least - np.float32(SURELY_ABOVE) * sigma
-    return int((least[:, pixels] > 1).any(axis=0).sum())
+    return int((least > 1).any(axis=0).sum())
 
 
 def _above_one(part: float, capture: Capture, *, shining: bool) -> str:

@@ -126,12 +126,11 @@ class Solution:
         """Return the standard error of the normals in degrees, [pixels] float32."""
         return self.sigma.astype(np.float32)
 
-    def albedo_sigma(self) -> np.ndarray | None:
-        """Return the standard deviation of the albedo, [3, pixels] float16, without that of its scale; None where it is not known."""
+    def albedo_sigma(self, pixels: slice | np.ndarray = slice(None)) -> np.ndarray | None:
+        """Return the standard deviation of the albedo of pixels, [3, n] float16, without that of its scale; None where it is not known."""
         if self.albedo_own is None or self.albedo_tilt is None:
             return None
-        sigma = np.hypot(self.albedo_own.astype(np.float32), self.albedo_tilt * self.standard_error())
-        return half(sigma)
+        return half(np.hypot(self.albedo_own[:, pixels].astype(np.float32), self.albedo_tilt[:, pixels] * self.standard_error()[pixels]))
 
     def whole_metals(self) -> np.ndarray | None:
         """Return F0, [3, pixels], 0 of blurred metals, whose outlines are ragged; None where the method estimates none."""
