@@ -49,11 +49,14 @@ class Peaks:
         """The chosen frames by their images."""
         self.found: dict[str, Peak] = {}
         """The peaks of those that were decoded, by their images."""
+        self.mask: np.ndarray | None = None
+        """The mask of the object, [rows, cols] bool; None where no frame is chosen or it cannot be read."""
         self._pixels: tuple[np.ndarray, ...] | None = None
         self._key = 0
         with suppress(StageError):
             if judged:
-                pixels = evenly(np.flatnonzero(capture.mask()), READ)
+                self.mask = capture.mask()
+                pixels = evenly(np.flatnonzero(self.mask), READ)
                 self._pixels = np.unravel_index(pixels, (capture.camera.height, capture.camera.width))
                 self._key = zlib.crc32(pixels.tobytes())
 

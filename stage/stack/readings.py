@@ -48,7 +48,7 @@ def said_by_readings(capture: Capture, peaks: Peaks | None = None, advance: Call
     peaks = Peaks(capture) if peaks is None else peaks
     if not peaks.frames:
         return []
-    mask, saturation = capture.mask(), capture.manifest.saturation
+    mask, saturation = capture.mask() if peaks.mask is None else peaks.mask, capture.manifest.saturation
     clear = mask.all() and capture.manifest.mask is not None and images.read_header(capture.file(capture.manifest.mask)).stored in ALPHA
     sides = _Sides(capture, mask) if _reaches_around(mask) else None
     spread = dict.fromkeys([*evenly(np.array([*peaks.frames]), FIRST).tolist(), *peaks.frames])
