@@ -37,8 +37,6 @@ SLIVER_PIXELS = 3.0
 """Mean width of a fragment below which it may be one of mixed pixels along an outline: twice its pixels over its cut edges."""
 SURROUNDED = 0.8
 """Part of the outline of a strip that one neighbour has where it does not lie between two parts: a wire, or a groove."""
-ALL = slice(None)
-"""All edges."""
 ROUNDS = 8
 """Most rounds in which small fragments join their neighbours; each at least halves a chain of them."""
 
@@ -103,7 +101,7 @@ class _Seam:
         self.shift = np.zeros(found.count)  # added to the heights of each fragment
         self.size = sizes_of(found.label, found.count)
 
-    def sides(self, edges: np.ndarray | slice = ALL) -> tuple[np.ndarray, np.ndarray]:
+    def sides(self, edges: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Return the groups on both sides of edges."""
         return self.group[self.ends[0][edges]], self.group[self.ends[1][edges]]
 

@@ -56,8 +56,7 @@ class EarlyStack:
             self._fingerprints.remember()
 
     def take(self, ingest: Ingest, path: Path) -> tuple[StackFile, set[int], dict[str, Any]] | None:
-        """Move the file to a path, and return it with the lights whose planes are those of the frames, and with the kept peaks; None where
-        it is of no use."""
+        """Move the file to a path; return it, the lights whose planes are those of the frames, and kept peaks; None: it is of no use."""
         if self._file is None or (self._lights, self._resolution) != (len(ingest.frames), ingest.capture.camera.resolution):
             return None
         there = {light for light, frame in enumerate(ingest.frames)

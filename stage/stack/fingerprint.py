@@ -18,7 +18,7 @@ BLOCK = 1 << 20
 class Fingerprints:
     """The content hashes of the files of one folder, which are kept in a JSON file between runs."""
 
-    def __init__(self, folder: Path, memory: Path, progress: Callable[[float], None] | None = None) -> None:
+    def __init__(self, folder: Path, memory: Path, progress: Callable[[float], None] = lambda _: None) -> None:
         """Load the hashes that an earlier run has kept.
         `progress`: called with the fraction of the files of each call of `of` that are done."""
         self._folder = folder
@@ -35,11 +35,10 @@ class Fingerprints:
         """Return the content hash of each file by its name."""
         wanted = list(dict.fromkeys(names))
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-fingerprints") as pool:
-            found = {}
+            found = dict[str, str]()
             for name, known in zip(wanted, pool.map(self._of, wanted), strict=True):
                 found[name] = known
-                if self._progress is not None:
-                    self._progress(len(found) / len(wanted))
+                self._progress(len(found) / len(wanted))
             return found
 
     def _of(self, name: str) -> str:

@@ -149,8 +149,7 @@ class Begun(Protocol):
     """A stack that was begun before all its images were there; stage.stack.early has it."""
 
     def take(self, ingest: "Ingest", path: Path) -> tuple[StackFile, set[int], dict[str, Any]] | None:
-        """Move the file to a path, and return it with the lights whose planes are those of the frames, and with the kept peaks; None where
-        it is of no use."""
+        """Move the file to a path; return it, the lights whose planes are those of the frames, and kept peaks; None: it is of no use."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ class Ingest:
 
     @classmethod
     def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
-           progress: Callable[[float], None] | None = None) -> "Ingest":
+           progress: Callable[[float], None] = lambda _: None) -> "Ingest":
         """Hash the images of the light frames of a capture.
         `cache`: the folder for the cache; None stands for `.relit` in the folder of the capture. `tracking`: tracking frames, to the
         reference of which every frame is warped; None leaves the frames as recorded. `progress`: called with the fraction of the files that

@@ -41,8 +41,7 @@ class Peaks:
     """The peaks of frames that stand for all, noted by whoever decodes frames, in several threads or one."""
 
     def __init__(self, capture: Capture) -> None:
-        """Choose the frames: none of a capture that has few under lights, or polarised pairs. Nothing is noted where the mask cannot be
-        read, of which those are told who need it."""
+        """Choose frames, none of a capture of few, or of polarised pairs; nothing is noted where the mask cannot be read."""
         lit = [frame for frame in capture.manifest.frames if isinstance(frame.light, DistantLight | PointLight)]
         judged = len(lit) >= FEWEST_FRAMES and not capture.is_polarised
         self.frames = {lit[index].image: lit[index] for index in evenly(np.arange(len(lit)), MOST_FRAMES)} if judged else {}
@@ -61,8 +60,7 @@ class Peaks:
                 self._key = zlib.crc32(pixels.tobytes())
 
     def note(self, image: str, recorded: np.ndarray) -> None:
-        """Note the peak of an image, unless its frame is none of the chosen.
-        `recorded`: [rows, cols, 3] uint8, uint16, float16 or float32, the values of the file."""
+        """Note the peak of a chosen frame; `recorded`: [rows, cols, 3] uint8, uint16, float16 or float32, the values of its file."""
         if self._pixels is None or image not in self.frames:
             return
         full, some = int(np.iinfo(recorded.dtype).max) if recorded.dtype.kind == "u" else 0, recorded[self._pixels]

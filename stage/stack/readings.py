@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
-from stage.capture.manifest import Frame
 from stage.colour.colour import GREY_WEIGHTS, LARGEST_INTEGER
 from stage.formats import images
 from stage.stack.correction import Correction
@@ -43,43 +42,33 @@ CLEAR = "mask: it is white everywhere and has alpha, which is not read: write th
 
 def said_by_readings(capture: Capture, peaks: Peaks | None = None, advance: Callable[[int], None] | None = None) -> list[str]:
     """Return a sentence for each of these that some frames of a capture under lights show and its doubts do not say already.
-    `peaks`: those of frames that were decoded for something else; a few frames are decoded where they are missing, and all that were chosen
-    where the few do not decide. `advance`: called with the count of frames that were looked at, MOST_FRAMES at most."""
+    `peaks`: those of frames that are decoded already; of others a few are decoded, or all that were chosen, where the few do not decide.
+    `advance`: called with the count of frames that were looked at, MOST_FRAMES at most."""
     peaks = Peaks(capture) if peaks is None else peaks
     if not peaks.frames:
         return []
     mask, saturation = capture.mask() if peaks.mask is None else peaks.mask, capture.manifest.saturation
     clear = mask.all() and capture.manifest.mask is not None and images.read_header(capture.file(capture.manifest.mask)).stored in ALPHA
-    sides = _Sides(capture, mask) if _reaches_around(mask) else None
+    turned = _turned_mask(capture, mask, peaks) if _reaches_around(mask) else []
     spread = dict.fromkeys([*evenly(np.array([*peaks.frames]), FIRST).tolist(), *peaks.frames])
-    for done, image in enumerate(sorted(spread, key=lambda image: -_frontal(peaks.frames[image])), start=1):
-        if sides is not None or image not in peaks.found:
-            recorded = capture.recorded(image)
-            peaks.note(image, recorded)
-            if sides is not None:
-                sides.note(peaks.frames[image], recorded)
+    toward = {image: light.direction[2] for image in spread if isinstance(light := peaks.frames[image].light, DistantLight)}
+    for done, image in enumerate(sorted(spread, key=lambda image: -toward.get(image, 0.0)), start=1):
+        if image not in peaks.found:
+            peaks.note(image, capture.recorded(image))
         if advance is not None:
             advance(done)
-        if sides is None and _decided(saturation, [*peaks.found.values()]):
+        if _decided(saturation, [*peaks.found.values()]):
             break
-    said = [*_clipped(saturation, [*peaks.found.values()]), *([] if sides is None else sides.said()), *([CLEAR] if clear else [])]
+    said = [*_clipped(saturation, [*peaks.found.values()]), *turned, *([CLEAR] if clear else [])]
     return [sentence for sentence in said if sentence not in capture.doubts]
-
-
-def _frontal(frame: Frame) -> float:
-    return frame.light.direction[2] if isinstance(frame.light, DistantLight) else 0.0
-
-
-def _limit(saturation: float | None, full: int) -> float:
-    return saturation or (1.0 if full else np.inf)
 
 
 def _decided(saturation: float | None, peaks: Sequence[Peak]) -> bool:
     """Return whether more frames would not change what is said of clipping: none do where a reading reaches the limit, and hardly any
     where several have neither clipped readings nor a highest one as low as cameras of few bits are clipped at."""
     top, full = max((each.top, each.full) for each in peaks)
-    low = full == LARGEST_INTEGER and top <= FOURTEEN_BITS
-    return top >= _limit(saturation, full) or (len(peaks) >= FIRST and not low and not any(each.is_spike for each in peaks))
+    suspicious = (full == LARGEST_INTEGER and top <= FOURTEEN_BITS) or any(each.is_spike for each in peaks)
+    return top >= (saturation or (1.0 if full else np.inf)) or (len(peaks) >= FIRST and not suspicious)
 
 
 def _clipped(saturation: float | None, frames: Sequence[Peak]) -> list[str]:
@@ -91,7 +80,7 @@ def _clipped(saturation: float | None, frames: Sequence[Peak]) -> list[str]:
     at = [each for each in frames if each.top == top]
     spikes = [each for each in at if each.is_spike]
     sizes = [each.at_top for each in spikes]
-    if sum(sizes) < FEWEST_CLIPPED or max(sizes) < UNLIKE * min(sizes) or top >= _limit(saturation, full):
+    if sum(sizes) < FEWEST_CLIPPED or max(sizes) < UNLIKE * min(sizes) or top >= (saturation or (1.0 if full else np.inf)):
         return []
     told = f"{top:.4g}" + (f" ({round(top * full)} of {full})" if full else "")
     return [f"saturation: many readings of {len(at)} images are {told}, and none is above: they are clipped there, and are taken for light "
@@ -109,30 +98,23 @@ def _reaches_around(mask: np.ndarray) -> bool:
     return bool((~mask & ~np.isin(parts, np.unique(parts[border]))).sum() >= WITHIN * left_out)
 
 
-class _Sides:
-    """Some pixels of what a mask has and of what it leaves out, under the lights."""
-
-    def __init__(self, capture: Capture, mask: np.ndarray) -> None:
-        correction = Correction.of(capture)
-        self._at = [(places, correction.at(places)) for places in (evenly(np.flatnonzero(side), PIXELS) for side in (mask, ~mask))]
-        self._seen: list[list[np.ndarray]] = []
-
-    def note(self, frame: Frame, recorded: np.ndarray) -> None:
-        """Note the grey radiance over the strength of the light."""
-        light = frame.light
+def _turned_mask(capture: Capture, mask: np.ndarray, peaks: Peaks) -> list[str]:
+    """Return the sentence for a mask of all but the object, by some pixels of it and of what it leaves out in each frame of the peaks."""
+    correction, seen = Correction.of(capture), list[list[np.ndarray]]()
+    sides = [(places, correction.at(places)) for places in (evenly(np.flatnonzero(side), PIXELS) for side in (mask, ~mask))]
+    for image, frame in peaks.frames.items():
+        recorded, light = capture.recorded(image), frame.light
+        peaks.note(image, recorded)
         assert isinstance(light, DistantLight | PointLight)
         strength = np.array(light.irradiance if isinstance(light, DistantLight) else light.intensity, np.float32)
         strength[strength == 0] = np.inf  # a channel without light shows nothing
         flat = recorded.reshape(-1, 3)
-        self._seen.append([at.corrected(flat[places][:, None], frame)[:, 0] / strength @ np.array(GREY_WEIGHTS) for places, at in self._at])
-
-    def said(self) -> list[str]:
-        """Return the sentence for a mask of all but the object."""
-        inside, outside = map(np.stack, zip(*self._seen, strict=True))
-        dark = np.median(inside.max(axis=0)) < DARK * np.median(outside.max(axis=0))
-        flat = _shape(inside) < PLANE and _shape(outside) > SHAPED * _shape(inside)
-        return [f"mask: it reaches all around the image and leaves out what is within, which is {'brighter' if dark else 'no plane'}: if "
-                "that is the object, it is the mask of the background: invert it"] if dark or flat else []
+        seen.append([at.corrected(flat[places][:, None], frame)[:, 0] / strength @ np.array(GREY_WEIGHTS) for places, at in sides])
+    inside, outside = map(np.stack, zip(*seen, strict=True))
+    dark = np.median(inside.max(axis=0)) < DARK * np.median(outside.max(axis=0))
+    flat_inside = _shape(inside) < PLANE and _shape(outside) > SHAPED * _shape(inside)
+    return [f"mask: it reaches all around the image and leaves out what is within, which is {'brighter' if dark else 'no plane'}: if that "
+            "is the object, it is the mask of the background: invert it"] if dark or flat_inside else []
 
 
 def _shape(readings: np.ndarray) -> float:
