@@ -56,11 +56,9 @@ TIMES_FREE = 3.0
 """Explanations with free parameters are named if they leave this many times less."""
 LARGEST_LEFT = 0.05
 """The most that an explanation may leave, relative to |b|: it must explain the images, which no Lambertian fit of bare metal does."""
-LEAST_ENCODED, LEAST_ORDER, LEAST_LEFT = 0.02, 0.03, 0.05
-"""The least misfit of the manifest at which an encoding, an order or the rest is looked for: what smooth real surfaces leave."""
-LEAST_LEFT_FEW = 0.1
-"""The least misfit at which directions are free under few lights, which do not show whether highlights of a plane follow their order:
-letters on a shining plate leave 0.06, and 157 of 158 permuted orders of lights more than this."""
+LEAST_ENCODED, LEAST_ORDER, LEAST_LEFT, LEAST_LEFT_FEW = 0.02, 0.03, 0.05, 0.1
+"""The least misfit of the manifest at which an encoding, an order or the rest is looked for: what smooth real surfaces leave; and
+directions of few lights, where highlights of a plane show no order: right letters on a plate leave 0.06, 157 of 158 wrong orders more."""
 LEAST_SPREAD = 0.1
 """Least standard deviation of the logarithm of the brightness that the images ask for: less does little harm."""
 ABOUT = 1.3
@@ -68,10 +66,8 @@ ABOUT = 1.3
 meant unless they leave more than this many times what the brightness leaves."""
 SCALE_ROUNDS, FREE_ROUNDS = 12, 12
 """Rounds of alternating least squares."""
-MEASURED_EVERY = 3
-"""Every third pixel suffices to measure the brightness, whose rounds are many."""
-STEP_EVERY = 2
-"""Every second pixel suffices to measure a step of the brightness."""
+MEASURED_EVERY, STEP_EVERY = 3, 2
+"""Every third pixel suffices to measure the brightness, whose rounds are many, and every second one a step of it."""
 STEADY_EVERYWHERE = 0.9
 """Least part of the pixels that reflect light which all images share: it adds to every reading."""
 PLENTY = 60

@@ -20,8 +20,8 @@ from service.cli.main import BLAS_THREADS, COMMANDS, main, program
 from service.server.base.log import logger
 from service.server.base.settings import Settings
 from service.server.process import devices as process_devices
-from service.solve import opening
 from stage.capture.capture import Capture
+from stage.stack.ingest import Ingest
 from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
@@ -150,7 +150,7 @@ def test_an_interruption_ends_with_130_and_a_sentence_and_a_defect_of_ours_keeps
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(opening, "open_stack", interrupt)
+    monkeypatch.setattr(Ingest, "stack", interrupt)
     write_capture(tmp_path / "cap", make_scene(size=4, lights=4))
     outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
     assert outcome.code == 130
