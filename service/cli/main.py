@@ -75,7 +75,6 @@ The program loads the modules that it needs: to import all of them takes longer 
 
 ABOUT = "Active-illumination captures to normals, materials, depth, USD assets and relit frames."
 BAD_INPUT, INTERRUPTED = 2, 130
-STOPPED = "relit: interrupted; results that are there are whole, run again to finish"
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 """The variables by which NumPy's linear algebra is told its number of threads. Without them it has one: kernels divide the large work among
 the cores, and matrices of some hundred rows cost more to divide than to solve."""
@@ -124,10 +123,10 @@ def main() -> None:
         app = listing() if sys.argv[1:] in ([], ["--help"]) else program(next(iter(sys.argv[1:]), None))
         code = app(prog_name="relit", standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
-            print(STOPPED, file=sys.stderr)
+            raise KeyboardInterrupt
         sys.exit(code)
-    except KeyboardInterrupt:  # while modules are loaded
-        print(STOPPED, file=sys.stderr)
+    except KeyboardInterrupt:  # also while modules are loaded
+        print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except TyperException as error:
         if text := " ".join(error.format_message().replace("Value error, ", "").split()):  # else the help has been shown

@@ -104,7 +104,7 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     timings.stage("ingest", len(capture.sources()))
     stack = ingest.stack(lambda done, _: timings.advance(done))
     if over_time is None:
-        (peaks := Peaks(capture)).recall(stack.peaks)
+        (peaks := Peaks(capture, mask)).recall(stack.peaks)
         capture = replace(capture, doubts=(*capture.doubts, *said_by_readings(capture, peaks)))
     if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
         if capture.is_polarised:

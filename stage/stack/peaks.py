@@ -40,8 +40,9 @@ class Peak(NamedTuple):
 class Peaks:
     """The peaks of frames that stand for all, noted by whoever decodes frames, in several threads or one."""
 
-    def __init__(self, capture: Capture) -> None:
-        """Choose frames, none of a capture of few, or of polarised pairs; nothing is noted where the mask cannot be read."""
+    def __init__(self, capture: Capture, mask: np.ndarray | None = None) -> None:
+        """Choose frames, none of a capture of few, or of polarised pairs. `mask`: that of the capture, [rows, cols] bool; None: it is read,
+        and nothing is noted where it cannot be."""
         lit = [frame for frame in capture.manifest.frames if isinstance(frame.light, DistantLight | PointLight)]
         judged = len(lit) >= FEWEST_FRAMES and not capture.is_polarised
         self.frames = {lit[index].image: lit[index] for index in evenly(np.arange(len(lit)), MOST_FRAMES)} if judged else {}
@@ -54,7 +55,7 @@ class Peaks:
         self._key = 0
         with suppress(StageError):
             if judged:
-                self.mask = capture.mask()
+                self.mask = capture.mask() if mask is None else mask
                 pixels = evenly(np.flatnonzero(self.mask), READ)
                 self._pixels = np.unravel_index(pixels, (capture.camera.height, capture.camera.width))
                 self._key = zlib.crc32(pixels.tobytes())

@@ -68,7 +68,12 @@ def _decided(saturation: float | None, peaks: Sequence[Peak]) -> bool:
     where several have neither clipped readings nor a highest one as low as cameras of few bits are clipped at."""
     top, full = max((each.top, each.full) for each in peaks)
     suspicious = (full == LARGEST_INTEGER and top <= FOURTEEN_BITS) or any(each.is_spike for each in peaks)
-    return top >= (saturation or (1.0 if full else np.inf)) or (len(peaks) >= FIRST and not suspicious)
+    return top >= _limit(saturation, full) or (len(peaks) >= FIRST and not suspicious)
+
+
+def _limit(saturation: float | None, full: int) -> float:
+    """Return the value from which readings are known to be clipped. `full`: as of `Peak`."""
+    return saturation or (1.0 if full else np.inf)
 
 
 def _clipped(saturation: float | None, frames: Sequence[Peak]) -> list[str]:
@@ -80,7 +85,7 @@ def _clipped(saturation: float | None, frames: Sequence[Peak]) -> list[str]:
     at = [each for each in frames if each.top == top]
     spikes = [each for each in at if each.is_spike]
     sizes = [each.at_top for each in spikes]
-    if sum(sizes) < FEWEST_CLIPPED or max(sizes) < UNLIKE * min(sizes) or top >= (saturation or (1.0 if full else np.inf)):
+    if sum(sizes) < FEWEST_CLIPPED or max(sizes) < UNLIKE * min(sizes) or top >= _limit(saturation, full):
         return []
     told = f"{top:.4g}" + (f" ({round(top * full)} of {full})" if full else "")
     return [f"saturation: many readings of {len(at)} images are {told}, and none is above: they are clipped there, and are taken for light "
