@@ -155,7 +155,8 @@ def descent_kernel(lanes: int) -> Any:
             judged = wp.where(turn >= turns[0], 1.0, 0.0)
             free = wp.where(turn >= wp.min(turns[0], 1), 1.0, 0.0)  # the first turn without weights finds them alone
             ax, ay, az, ox, oy, oz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
-            nv, va, vo, explained = lane_type(), lane_type(), lane_type(), lane_type()
+            nv, va, vo = lane_type(), lane_type(), lane_type()
+            known = lane_type(judged)  # above 0 where there are weights; before any are found, no reading is a misfit
             for k in range(lanes):
                 tangent, other = tangents(wp.vec3(nx[k], ny[k], nz[k]))
                 ax[k] = tangent[0]
@@ -175,7 +176,7 @@ def descent_kernel(lanes: int) -> Any:
                     view_slope[a, k] = masking_slope(nv[k], alphas[a], view_root[a, k])
             for a in range(MIXTURE):
                 for k in range(lanes):
-                    explained[k] = wp.max(explained[k], x[a, k])
+                    known[k] = wp.max(known[k], x[a, k])
             # normal equations of weights and tilts, and the cost
             total, product = lane_type(), lane_type(1.0)
             g = triangle()
@@ -224,7 +225,7 @@ def descent_kernel(lanes: int) -> Any:
                     f[OTHER, k] = by_h[k] * (lo[k] + vo[k]) * inverse[k] + by_l[k] * lo[k] + by_v[k] * vo[k]
                     sigma = 1.0 / (criteria.noise[0] + criteria.noise[1] * wp.max(reading[k], 0.0))
                     off = (reading[k] - predicted[k]) * sigma
-                    off2 = wp.where(explained[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
+                    off2 = wp.where(known[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
                     given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
                     weight, factor = weigh_grey(reading[k], predicted[k], off2, given, sigma, criteria.shadow)
                     w[k] = weight
