@@ -15,7 +15,7 @@ class Status(IntEnum):
     TOO_FEW_LIGHTS = 2
     """Fewer usable lights than the unknowns need (shadow, saturation or rejection took the rest)."""
     DARK = 3
-    """No light gave a reading above zero."""
+    """No light gave a reading above the noise."""
     ILL_POSED = 4
     """The usable lights lie close to one plane, or the readings are the same from every side: the normal is not determined."""
     NOT_FACING = 5

@@ -17,6 +17,7 @@ from service.solve.height.distance import Distance, find_distance
 from service.solve.lights.intensities import LightsOverTime, choose_intensities
 from service.solve.lights.other_lights import OtherLights, Rig, find_other_lights
 from service.solve.methods.methods import METHODS, Solver, solve_in_rig
+from service.solve.unlit import unlit
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_surface, distant_lights
 from stage.capture.manifest import FILE_NAME
@@ -48,6 +49,8 @@ class Opened(NamedTuple):
     """The lights as the manifest has them."""
     solver: Solver
     given: SolveInput
+    unlit: np.ndarray
+    """[rows, cols] bool, pixels of the capture's mask that no lamp lights, which are not solved."""
     facts: dict[str, Any]
     """Facts about the lights for the report."""
     found: "UnknownLights | RefinedLights | RefinedPlaces | None" = None
@@ -115,6 +118,11 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
             stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
             if over_time is None:  # steps share the lights of the first
                 capture, stack, lights = _without_dark_frames(capture, stack, lights, mask)
+    dark = unlit(stack if pairs is None else pairs.whole, mask, timings)
+    mask = mask & ~dark
+    if not mask.any():
+        raise ManifestError(f"{capture.folder / FILE_NAME}: mask: no light reaches its pixels, whose readings are noise alone: it lies on "
+                            "the black background")
     if sharing is not None:
         sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
@@ -127,7 +135,7 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     if request.lights is not LightsKnown.DECLARED:
         timings.stage("lights", 1)
         found = _find_lights(request.lights, given, lights, capture)
-        return Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, brighter, distance)
+        return Opened(capture, method, found.lights, found.lights, solver, given, dark, found.facts, found, brighter, distance)
     used: Any = lights
     facts: dict[str, Any] = {}
     if isinstance(lights, DistantLights) and given.refine_intensities:
@@ -135,7 +143,7 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
         used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
     other = find_other_lights(given, used) if isinstance(used, DistantLights) else None
     rig = other.rig if other is not None and over_time is None and pairs is None else None  # steps would find rigs of their own
-    return Opened(capture, method, used, lights, solver, given, facts if rig is None else facts | rig.facts(), brighter=brighter,
+    return Opened(capture, method, used, lights, solver, given, dark, facts if rig is None else facts | rig.facts(), brighter=brighter,
                   distance=distance, other=other, rig=rig)
 
 

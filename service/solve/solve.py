@@ -113,6 +113,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     """Find the height of a solution, how sure it is, and what does not fit; the solution is changed."""
     given, shape = opened.given, opened.given.mask.shape
     solution.facts = opened.facts | solution.facts
+    solution.status[opened.unlit.reshape(-1)] = Status.DARK
     mark_not_facing(opened.capture.camera, solution)
     if given.pairs is not None:
         _say_of_pairs(given, opened.method, solution)
@@ -157,7 +158,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
 
 def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale: float) -> SolveResult:
     capture, method, given, solution = opened.capture, opened.method, opened.given, judged.solution
-    stack, mask, timings = given.stack, given.mask, given.timings
+    stack, mask, timings = given.stack, given.mask | opened.unlit, given.timings
     status = solution.status.reshape(mask.shape)
     solved = np.isin(status, SOLVED)
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
@@ -168,7 +169,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
         solution.warnings.append(_nothing_solved(counts, request.least_confidence))
     elif (doubtful := doubtful_normals(status)) is not None:
         solution.warnings.append(doubtful)
-    solution.warnings += height_warnings(judged.guessed, method, mask)
+    solution.warnings += height_warnings(judged.guessed, method, given.mask)
     outdated = devices.outdated_driver() if request.device is None else None
     solution.warnings += [outdated] if outdated else []
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]

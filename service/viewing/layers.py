@@ -57,7 +57,7 @@ MEANINGS = {
     Status.UNSOLVED: "Outside the object: nothing was to be solved here.",
     Status.OK: "Solved.",
     Status.TOO_FEW_LIGHTS: "Too few lights gave a usable reading.",
-    Status.DARK: "No light gave a reading above zero.",
+    Status.DARK: "No light gave a reading above the noise.",
     Status.ILL_POSED: "The usable lights lie close to one plane, or all readings are the same: the normal is not determined.",
     Status.NOT_FACING: "The best normal points away from the camera.",
     Status.SATURATED: "Too few usable lights: the others saturate.",
