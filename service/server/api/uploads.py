@@ -150,11 +150,8 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
     def make(connection: sa.Connection) -> str:
         _hold(service, caller, connection, intake)
         before = uploads.at_path(connection, intake, given.path)
-        if before is not None and before["done"]:
-            uploads.remove(connection, before["id"])
-            service.storage.delete(layout.intake(caller.project, intake), given.path)
-        elif before is not None and _expired(service, before):
-            uploads.remove(connection, before["id"])  # its part file, which nobody can continue, goes with the next housekeeping
+        if before is not None and (before["done"] or _expired(service, before)):
+            uploads.remove(connection, before["id"])  # the part file of an expired one goes with the next housekeeping
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
         count, most = uploads.count(connection, intake), settings.max_capture_files
@@ -169,6 +166,8 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: t
         except uploads.PathTaken as error:
             raise ApiError("conflict", str(error)) from None
         audit.record(connection, caller, "upload.create", identifier)
+        if before is not None and before["done"]:  # when nothing can refuse the request any more
+            service.storage.delete(layout.intake(caller.project, intake), given.path)
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]

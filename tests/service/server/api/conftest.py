@@ -91,7 +91,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("keyed")
     (folder / "of-willow" / "owl").mkdir(parents=True)
     quotas = {"quota-larch": "max_project_captures=2", "quota-willow": "max_project_captures=3", "oak": "max_project_bytes=100",
-              "elm": "max_project_jobs=1"}
+              "beech": "max_project_bytes=100", "elm": "max_project_jobs=1"}
     with serving(folder, "--device", "none", host="0.0.0.0", roots=str(SAMPLES), project_roots=f"willow={folder / 'of-willow'}",
                  project_quotas=",".join(f"{project}:{quota}" for project, quota in quotas.items())) as running:
         yield running

@@ -230,6 +230,17 @@ def test_bytes(keyed):
         assert oak.post(place, headers=TUS | {"Upload-Length": "40", "Upload-Metadata": "path Yg=="}).status_code == 201
 
 
+def test_a_file_whose_replacement_is_refused_stays(keyed):
+    with keyed.client(keyed.key("beech")) as beech:
+        capture = beech.post("/v1/captures", json={"name": "a"}).json()["id"]
+        made = beech.post(f"/v1/captures/{capture}/files", headers=TUS | {"Upload-Length": "3"})
+        beech.patch(made.headers["location"], content=b"old", headers={
+            "Tus-Resumable": "1.0.0", "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}).raise_for_status()
+        refused(beech.post(f"/v1/captures/{capture}/files", headers=TUS | {"Upload-Length": "101"}), 413, "quota max_project_bytes: ")
+        assert (keyed.data / "projects" / "beech" / "captures" / capture / "a").read_bytes() == b"old"
+        assert beech.get(f"/v1/captures/{capture}/files").json()["files"][0]["done"]
+
+
 def test_jobs(keyed, keyed_database):
     with keyed.client(keyed.key("elm")) as elm:
         request = {"kind": "solve", "capture": accepted(keyed_database, elm, "elm", SAMPLES / "owl")}
