@@ -201,7 +201,7 @@ class _Meter:
         counts = np.histogram(taken[brightest].pixels.max(axis=2)[seen], bins=BINS, range=(0, 1))[0]
         across = 3
         review = self._request.review
-        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", zebra(each.pixels, self._space, self._full, review))
+        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.3g} % clipped", zebra(each.pixels, self._space, self._full, review))
                  for each, reading in zip(taken, result.readings, strict=True)]
         tiles.append((f"readings under {result.readings[brightest].lamp}", bars(counts, TILE, 4 * BINS)))
         write_sheet(result.picture, [tiles[begin:begin + across] for begin in range(0, len(tiles), across)])

@@ -232,7 +232,7 @@ def _tracking_unlike(blocks: np.ndarray, period: Sequence[Shot], names: Sequence
     gain, frame = worst
     if 1 / ALIKE <= gain <= ALIKE:
         return None
-    return (f"{names[frame]}: should be a tracking frame, and has {gain:.2g} times the light of those of the periods around it: "
+    return (f"{names[frame]}: should be a tracking frame, and has {gain:.3g} times the light of those of the periods around it: "
             "lamps failed, or a frame was lost")
 
 

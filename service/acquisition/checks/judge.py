@@ -174,7 +174,7 @@ class Judge:
     def _exposure_faults(self, seen: Seen) -> Iterator[Fault]:
         shot, sample = seen.shot, seen.sample
         if sample.clipped > CLIPPED_SHARE and not shot.may_clip:
-            yield Fault(shot.key, FaultKind.CLIPPED, f"{100 * sample.clipped:.2g} % of the lit pixels are clipped")
+            yield Fault(shot.key, FaultKind.CLIPPED, f"{100 * sample.clipped:.3g} % of the lit pixels are clipped")
         if shot.lamp is None and shot.levels.any() and sample.bright < LEAST_BRIGHT:
             dark = [each.sample.bright for each in self._seen.values() if _is_dark(each.shot)]
             kind = FaultKind.UNLIT if dark and sample.bright < 2 * max(dark) else FaultKind.DARK
@@ -189,7 +189,7 @@ class Judge:
         usual = np.mean(lamps, axis=0)
         lit = usual > 2 * SHADE_PART * usual.mean()
         above = float((seen.sample.blocks - np.quantile(lamps, SHADE_QUANTILE, axis=0))[lit].mean() / max(float(usual[lit].mean()), 1e-30))
-        return [Fault(seen.shot.key, FaultKind.AMBIENT, f"reads {100 * above:.2g} % of the light of a lamp more than pictures under lamps "
+        return [Fault(seen.shot.key, FaultKind.AMBIENT, f"reads {100 * above:.0f} % of the light of a lamp more than pictures under lamps "
                       "do in the shade")] if above > DARK_PART else []
 
     def _faults(self, seen: Seen, others: list[Seen]) -> list[Fault]:
@@ -255,7 +255,7 @@ class Judge:
         if gain < BRIGHT_GAIN or seen.root @ unit_root(expected_blocks(used)) < seen.root @ unit_root(usual):
             return None
         kind = FaultKind.CLIPPED if seen.sample.clipped > BRIGHT_CLIPPED_SHARE else FaultKind.BRIGHT
-        return Fault(seen.shot.key, kind, f"has {gain:.2g} times the light of the others, {100 * seen.sample.clipped:.2g} % of it clipped")
+        return Fault(seen.shot.key, kind, f"has {gain:.3g} times the light of the others, {100 * seen.sample.clipped:.3g} % of it clipped")
 
     def _few_faults(self, seen: Seen, others: list[Seen], dark: np.ndarray | float) -> list[Fault]:
         """Return the fault of a picture under one of a few lamps, of which none is predicted."""
@@ -305,7 +305,7 @@ def _is_dark(shot: Shot) -> bool:
 
 
 def _ambient(shot: Shot, more: float) -> Fault:
-    return Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")
+    return Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.0f} % of the light of a usual picture more than it should")
 
 
 def _moved(seen: Seen, expected: Bands, usual: float) -> Fault | None:

@@ -125,7 +125,7 @@ def refuse_dimming(shots: Sequence[Shot], rig: Rig) -> None:
             address = rig.lights[index].address
             if 0 < level < 1 and address is not None and not (address.protocol in DMX or rig.controllers.dims(address.protocol)):
                 advice = "" if address.protocol == "manual" else f" (controllers.{address.protocol}.on has no field {{level}})"
-                raise RequestError(f"the plan has {rig.lights[index].name} at {100 * level:.2g} % of its light for {shot.key}, and its "
+                raise RequestError(f"the plan has {rig.lights[index].name} at {100 * level:.3g} % of its light for {shot.key}, and its "
                                    f"protocol {address.protocol} only switches{advice}: gradients and a level below 1 need lamps that are "
                                    "dimmed")
 
