@@ -89,6 +89,8 @@ def said(fault: Any) -> str:
             return "is not a known key"
         case "missing":
             return "is missing"
+        case "json_invalid":
+            return f"is no JSON ({fault['ctx']['error']})"
         case "value_error":
             return str(fault["ctx"]["error"])
         case "union_tag_invalid":

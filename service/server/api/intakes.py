@@ -78,6 +78,8 @@ def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) ->
     with audit.recorded(service.database, caller, action, intake) as connection:
         if not intakes.begin_check(connection, intake):
             raise ApiError("conflict", f"{intake} is {before['state']} already")
+        if before["folder"] is None and uploads.count(connection, intake) == 0:
+            raise ApiError("conflict", f"{intake} has no files yet: upload them first")
         if (file := uploads.unfinished(connection, intake)) is not None:
             raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
         submit(service, caller, job, connection, [intake])

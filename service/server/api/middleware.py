@@ -13,8 +13,8 @@ from service.server.api.problems import answer
 from service.server.base.log import logger
 
 REQUEST_ID = b"x-request-id"
-QUIET = ("/healthz", "/readyz", "/metrics")
-"""Paths that are asked for every few seconds; their requests are logged at the level debug."""
+QUIET = ("/healthz", "/readyz", "/metrics", "/set/state")
+"""Paths that are asked for every few seconds or more often; their requests are logged at the level debug."""
 MAX_BYTES = 1 << 20
 """Most bytes of a JSON body; the light keys of a long film have some hundred kilobytes."""
 UPLOADS = "/v1/uploads/"

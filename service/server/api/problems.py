@@ -107,9 +107,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(
-                    said(fault) if fault["type"] == "string_pattern_mismatch" else fault["msg"].removeprefix("Value error, ")))
-                  for fault in error.errors()[:MAX_FAULTS]]
+        faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(said(fault))) for fault in error.errors()[:MAX_FAULTS]]
         return answer(request, "invalid", "; ".join(f"{fault.field}: {fault.message}" for fault in faults), faults=faults)
 
     @app.exception_handler(RequestError)

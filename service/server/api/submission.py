@@ -121,7 +121,7 @@ def spelled_out(service: Service, project: str, request: JobRequest) -> JobReque
         if request.environment is None and (request.keys is None or not request.keys.lights):
             raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights")
         _require_frames(service, request.options.frames, frame_numbers(request.options.frames, 1))
-    if isinstance(request, asked.PipelineJob):
+    if isinstance(request, asked.PipelineJob) and (request.environment is not None or request.keys is not None):
         return request.model_copy(update={"relight": _with_frames(service, project, request.capture, request.relight)})
     return request
 

@@ -14,7 +14,7 @@ from service.server.database.jobs import Claim
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted, finish, finished, made_by, refused, report_of, submit
-from tests.service.server.api.tus import encoded
+from tests.service.server.api.tus import Tus, encoded
 from tests.service.server.prepared import opened
 
 
@@ -68,8 +68,10 @@ def test_a_registered_capture_is_checked_again_when_mended_and_not_deleted_while
 
 
 @pytest.mark.parametrize("kind", ["captures", "environments"])
-def test_what_has_no_file_is_refused_and_its_check_begins_again_by_another_validation_alone(server, client, kind):
+def test_what_has_no_file_is_not_checked_and_a_check_begins_again_by_another_validation_alone(server, client, kind):
     made = client.post(f"/v1/{kind}", json={"name": "empty"}).json()["id"]
+    refused(client.post(f"/v1/{kind}/{made}/validate"), 409, "has no files yet")
+    Tus(server.url).send(f"/v1/{kind}/{made}", "a.exr", b"no image")
     client.post(f"/v1/{kind}/{made}/validate").raise_for_status()
     server.wait(client, f"/v1/{kind}/{made}", ("refused",))
     check = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"].get("intake") == made)

@@ -77,7 +77,7 @@ def test_the_highest_priority_goes_first(server, client, long, dome):
     assert (changed.status_code, changed.json()["priority"], changed.json()["state"]) == (200, 95, "queued")
     refused(client.patch(f"/v1/jobs/{before['id']}", json={"priority": 1}), 409, "only a queued job has a priority to change")
     refused(client.patch(f"/v1/jobs/{low['id']}", json={"priority": 101}), 422, "less than or equal to 100")
-    refused(client.patch(f"/v1/jobs/{low['id']}", json={}), 422, "Field required")
+    refused(client.patch(f"/v1/jobs/{low['id']}", json={}), 422, "is missing")
     client.post(f"/v1/jobs/{dropped['id']}/cancel").raise_for_status()
     client.post(f"/v1/jobs/{before['id']}/cancel").raise_for_status()
     began = {name: finish(server, client, job)["started_at"] for name, job in

@@ -166,7 +166,7 @@ def test_what_cannot_be_driven_is_refused_by_name(client, lamps, relit, tmp_path
     sentence = relit.refused("submit", "drive", tmp_path / "wrong.json", "--keys", tmp_path / "sun.json")  # before a server is asked
     assert "wrong.json: lights[0].least: " in sentence
     refused(ask(rig={**lamps, "schema": "relit.rig/2"}, keys=SUN), 422, "relit.rig/1")
-    refused(ask(keys=SUN), 422, "Field required")
+    refused(ask(keys=SUN), 422, "is missing")
     refused(ask(rig=lamps), 422, "nothing lights the frames")
     refused(ask(rig=lamps, environment=f"env_{'0' * 20}"), 404, "environment: ")
     refused(ask(rig=lamps, keys=SUN, options={"frames": "1-20001"}), 422, "20000 are allowed in a job")
