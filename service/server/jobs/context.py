@@ -168,8 +168,8 @@ class StepFiles(NamedTuple):
             return _named(context.storage.local(layout.intake(project, identifier), progress=self.progress), identifier), None
         folder = Path(row["folder"])
         root = next((root for root in context.settings.roots_of(project) if folder.is_relative_to(root)), None)
-        if resolved(folder) != folder or root is None:
-            raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
+        if root is None or resolved(folder) != folder or not folder.exists():
+            raise RequestError(f"{identifier}: is not where it was registered any more, or in none of the folders that the operator allows")
         top = folder if identifier.startswith(CAPTURE) else folder.parent
         self.held.enter_context(inputs.confined(top, root, max_pixels=context.settings.max_pixels))
         return _named(folder, identifier), root

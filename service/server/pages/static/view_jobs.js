@@ -1,6 +1,6 @@
 /** Views, which jobs of the kind `view` prepare: of a capture, or of the maps that a job has made. */
 
-import { listing, read, resultsOf, reveal, submitJob } from "./api.js";
+import { listing, read, Refusal, resultsOf, reveal, submitJob } from "./api.js";
 import { element } from "./element.js";
 import { watch } from "./events.js";
 import { doingOf } from "./jobs_table.js";
@@ -52,7 +52,7 @@ export async function captureOf(job) {
 export async function openView(capture, maps, step, place, more = {}) {
   const body = { kind: "view", priority: PRIORITY, capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }), ...more };
   let job = (await findView({ capture, maps, step })) ?? (await submitJob(body));
-  job = await followed(job, place, "This is looked at for the first time: its view is being prepared.", "the view was not prepared");
+  job = await followed(job, place, "This is looked at for the first time: its view is being prepared.", "The view was not prepared");
   return { job, files: resultsOf(job.id) };
 }
 
@@ -78,7 +78,7 @@ export async function followed(job, place, doing, fault) {
       told.remove();
     }
     if (job.state !== "succeeded") {
-      throw new Error(`${fault}: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
+      throw new Refusal(409, `${fault}: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
     }
   }
   return job;

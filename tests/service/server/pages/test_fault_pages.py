@@ -1,10 +1,13 @@
 """What goes wrong is said on a page to browsers, and in a problem document to programs; a key that is refused is told why."""
 
 import re
+import shutil
 
 import pytest
 
+from service.client import Client
 from service.requests.keys import Scope
+from tests.scenes.captures import write_capture
 from tests.service.server.pages.axe import assert_accessible
 from tests.service.server.pages.conftest import SAMPLES, expect, opened_page
 from tests.service.server_process import new_key, revoke
@@ -35,6 +38,17 @@ def test_what_does_not_exist_is_a_page_with_a_way_on(open_to_axe, path):
     assert_accessible(open_to_axe, 390)
     open_to_axe.get_by_role("link", name="All captures").click()
     open_to_axe.wait_for_url(re.compile("/$"))
+
+
+@pytest.mark.long
+def test_a_view_that_fails_says_why_and_does_not_blame_the_page(server, page, tmp_path):
+    with Client(server.url, None) as client:
+        capture = client.captures.upload(write_capture(tmp_path / "cap")).id
+    shutil.rmtree(server.data / "projects" / "default" / "captures" / capture)
+    page.goto(f"/object/{capture}")
+    fault = page.get_by_role("alert")
+    fault.get_by_text("The view was not prepared: ").wait_for()
+    expect(fault).not_to_contain_text("failed")
 
 
 @pytest.mark.long
