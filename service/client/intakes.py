@@ -116,12 +116,14 @@ class Intakes:
             progress: told of the stages `hash` and `upload`, in MiB.
 
         Raises:
-            FileError: a file cannot be read.
+            FileError: a file cannot be read, or a folder holds no manifest; nothing is sent then.
             IntakeRefused: the check found a fault.
             ClientError: the service answers with an error, or does not answer.
         """
         name = source.resolve().name if name is None else name
         found = files_of(source)
+        if self._source == "folder" and not any(name.endswith(".json") for _, name in found):
+            raise FileError(f"{source}: holds no capture.json: relit import writes one, as the pages of the service do")
         size = sum(path.stat().st_size for path, _ in found)
         files = hash_files(found, parallel=self._parallel, progress=TransferProgress(progress, "hash", size))
         token = hashlib.sha256(f"{self._path}\0{name}\0{hash_of_all(files)}".encode()).hexdigest()

@@ -180,6 +180,9 @@ def test_files_that_cannot_be_sent(client: Client, tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileError, match="empty: has no files"):
         client.captures.upload(tmp_path / "empty")
+    (tmp_path / "empty" / "000.png").write_bytes(b"a photograph")
+    with pytest.raises(FileError, match=r"empty: holds no capture\.json: relit import"):
+        client.captures.upload(tmp_path / "empty")
     capture = write_capture(tmp_path / "ball")
     (capture / "more").symlink_to(tmp_path / "empty", target_is_directory=True)
     with pytest.raises(FileError, match="more: is a link to a folder"):
