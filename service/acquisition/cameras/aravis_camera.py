@@ -197,5 +197,6 @@ def _unref(thing: int) -> None:
 
 def open_camera(detail: str, setup: Setup) -> AravisCamera:
     """Return the camera of a name, such as that which `arv-tool-0.8` lists, or the first one."""
+    camera = AravisCamera(detail, setup)
     setup.spool.mkdir(parents=True, exist_ok=True)
-    return AravisCamera(detail, setup)
+    return camera

@@ -28,7 +28,7 @@ class VideoDevice(Camera):
         self._live = detail.isdigit()
         self._video = cv2.VideoCapture(int(detail) if self._live else detail)
         if not self._video.isOpened():
-            raise RequestError(f"{self._name}: cannot be opened: check that it is connected and that no other program uses it")
+            raise RequestError(f"{self._name}: cannot be opened: check that it is there, or connected, and that no other program uses it")
         if self._live:
             self._fix()
 
@@ -82,5 +82,6 @@ def open_camera(detail: str, setup: Setup) -> VideoDevice:
     """Return the device of a number, or a video file."""
     if not detail:
         raise RequestError("--camera video: give the number of the device, as in video:0, or a file")
+    camera = VideoDevice(detail, setup)
     setup.spool.mkdir(parents=True, exist_ok=True)
-    return VideoDevice(detail, setup)
+    return camera

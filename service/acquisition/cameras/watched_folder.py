@@ -73,7 +73,8 @@ class WatchedFolder(Camera):
         except subprocess.TimeoutExpired as error:
             raise RequestError(f"--trigger {' '.join(command)}: did not end within {error.timeout:g} s") from error
         except (subprocess.CalledProcessError, OSError) as error:
-            said = " ".join(str(getattr(error, "stderr", "") or error).split())[:200]
+            code = f"exit code {error.returncode}" if isinstance(error, subprocess.CalledProcessError) else error.strerror
+            said = " ".join(str(getattr(error, "stderr", "") or code).split())[:200]
             raise RequestError(f"--trigger {' '.join(command)}: failed: {said}") from error
 
     def _files(self) -> list[Path]:

@@ -1,5 +1,6 @@
 """Lamps of a controller at a serial port, which takes a line of text for each change and may answer with one (pyserial)."""
 
+import os
 import re
 import time
 from pathlib import Path
@@ -53,7 +54,7 @@ class SerialLine:
 
 def _reason(error: Exception) -> str:
     """Return why the system refuses, in its words where it has any."""
-    return str(getattr(error, "strerror", None) or error).lower()
+    return os.strerror(error.errno).lower() if isinstance(error, OSError) and error.errno else str(error)
 
 
 def open_switch(path: Path, rig: Rig, ask: Ask) -> SwitchedLamps:

@@ -241,6 +241,23 @@ def test_automatic_modes_of_a_video_device_are_switched_off_or_it_is_refused(set
         values[number] = before
 
 
+def test_what_is_not_there_is_named_as_it_was_given_and_leaves_no_folder(tmp_path, setup):
+    for camera, words in (("video:Lost.mp4", "Lost.mp4: cannot be opened"), ("gphoto2", "camera gphoto2: ")):
+        with pytest.raises(RequestError, match=words):
+            open_camera(camera, setup)
+    assert not setup.spool.exists()
+    stage = Stage(tmp_path / "watch")
+    rig = write_rig(tmp_path / "rig.json", stage, "serial", {"serial": {"port": "/dev/ttyLost", "on": "on {index}\n", "off": "off\n"}})
+    with pytest.raises(RequestError, match="/dev/ttyLost: cannot be opened: no such file or directory: check"):
+        acquire(request(tmp_path, stage, rig), refuse_to_ask)
+
+
+def test_a_trigger_that_fails_without_a_word_says_its_exit_code(tmp_path):
+    (tmp_path / "watch").mkdir()
+    with pytest.raises(RequestError, match=r"^--trigger false: failed: exit code 1$"):
+        open_camera(f"watch:{tmp_path / 'watch'}", Setup(tmp_path / "spool", 1.0, ("false",), None)).take(None)
+
+
 def test_a_serial_board_that_never_answers(tmp_path):
     host, board = os.openpty()
     tty.setraw(board)
