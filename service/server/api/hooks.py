@@ -12,7 +12,7 @@ from service.server.api.context import Admin, Service, ServiceDep
 from service.server.api.jobs import StrictJson
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
-from service.server.api.problems import ApiError, responses
+from service.server.api.problems import found_in_project, responses
 from service.server.base import outgoing
 from service.server.database import audit, hooks, quotas
 
@@ -46,10 +46,7 @@ def list_hooks(service: ServiceDep, caller: Admin) -> HookList:
 @router.get("/{hook}", responses=responses(404), summary="Look at a hook")
 def get_hook(service: ServiceDep, caller: Admin, hook: HookName) -> HookView:
     """Return a hook, how many deliveries wait, and the one that was tried last."""
-    found = hooks.listing(service.database, caller.project, hook)
-    if not found:
-        raise _missing(hook)
-    return _view(service, found[0])
+    return _view(service, found_in_project(next(iter(hooks.listing(service.database, caller.project, hook)), None), hook))
 
 
 @router.post("/{hook}/test", status_code=202, responses=responses(404), summary="Send a test to a hook")
@@ -57,8 +54,7 @@ def send_test(service: ServiceDep, caller: Admin, hook: HookName) -> DeliveryVie
     """Queue a delivery of the type `hook.test`, which is signed, sent and tried again as the others are, and end the pause of the hook."""
     service.limiter.take(caller.key, CREATION_COST - 1)
     with audit.recorded(service.database, caller, "hook.test", hook) as connection:
-        if (made := hooks.record_test(connection, caller.project, hook)) is None:
-            raise _missing(hook)
+        made = found_in_project(hooks.record_test(connection, caller.project, hook), hook)
     return DeliveryView.model_validate(dict(made))
 
 
@@ -66,12 +62,7 @@ def send_test(service: ServiceDep, caller: Admin, hook: HookName) -> DeliveryVie
 def delete_hook(service: ServiceDep, caller: Admin, hook: HookName) -> None:
     """Delete a hook; deliveries that wait are not sent any more."""
     with audit.recorded(service.database, caller, "hook.delete", hook) as connection:
-        if not hooks.remove(connection, caller.project, hook):
-            raise _missing(hook)
-
-
-def _missing(hook: str) -> ApiError:
-    return ApiError("not-found", f"there is no {hook} in this project")
+        found_in_project(hooks.remove(connection, caller.project, hook) or None, hook)
 
 
 def _view(service: Service, row: sa.RowMapping) -> HookView:

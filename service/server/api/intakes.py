@@ -21,7 +21,7 @@ from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service
 from service.server.api.jobs import StrictJson
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
-from service.server.api.problems import ApiError, responses
+from service.server.api.problems import ApiError, found_in_project, responses
 from service.server.api.submission import submit
 from service.server.base.safe_names import shown
 from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
@@ -56,10 +56,7 @@ class NewEnvironment(BaseModel):
 
 def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
     """Return the row of a capture or environment of the caller's project, or refuse the request."""
-    row = intakes.find(service.database, identifier, caller.project)
-    if row is None:
-        raise ApiError("not-found", f"there is no {identifier} in this project")
-    return row
+    return found_in_project(intakes.find(service.database, identifier, caller.project), identifier)
 
 
 def _view(service: Service, caller: Caller, identifier: str) -> IntakeView:
@@ -95,10 +92,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
                 description=f"List the {kind}s of the project, one page at a time.")
     def list_intakes(service: ServiceDep, caller: Reader, limit: Limit = 100,
                      before: Annotated[str | None, Query(pattern=is_id)] = None) -> IntakePage:
-        after = None
-        if before is not None:
-            row = row_of(service, caller, before)
-            after = row["created_at"], row["id"]
+        after = None if before is None else row_of(service, caller, before)
         rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
         return IntakePage(items=_views(service, rows[:limit]), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 

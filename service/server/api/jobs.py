@@ -16,7 +16,7 @@ from service.requests.base.identifiers import JobId
 from service.requests.jobs import CheckJob, UserJob
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
-from service.server.api.problems import ApiError, responses
+from service.server.api.problems import ApiError, found_in_project, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.database import audit, idempotency, jobs, quotas
 from service.server.database.keys import Caller
@@ -91,12 +91,7 @@ def list_jobs(service: ServiceDep, caller: Reader, state: States = (), kind: Kin
               limit: Annotated[int, Query(ge=1, le=500)] = 100,
               before: Annotated[JobId | None, Query(description="`next` of the page before.")] = None) -> JobPage:
     """List the jobs of the project, one page at a time."""
-    after = None
-    if before is not None:
-        row = jobs.find(service.database, before, caller.project)
-        if row is None:
-            raise ApiError("not-found", f"before: {before} is not in this project")
-        after = row["created_at"], row["id"]
+    after = None if before is None else found_in_project(jobs.find(service.database, before, caller.project), before)
     rows = jobs.latest(service.database, caller.project, states=state, kinds=kind, limit=limit + 1, before=after)
     return JobPage(jobs=[JobView.of(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
@@ -166,10 +161,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
 
 def view(service: Service, caller: Caller, job: str) -> JobView:
     """Return a job of the caller's project, or refuse the request."""
-    row = jobs.find(service.database, job, caller.project)
-    if row is None:
-        raise ApiError("not-found", f"there is no {job} in this project")
-    return JobView.of(row)
+    return JobView.of(found_in_project(jobs.find(service.database, job, caller.project), job))
 
 
 def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:

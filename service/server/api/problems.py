@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.encoders import jsonable_encoder
@@ -20,6 +20,7 @@ from service.server.pages import routes as pages
 from stage.errors import StorageError
 from stage.records import said
 
+T = TypeVar("T")
 MEDIA_TYPE = "application/problem+json"
 CHECKSUM_MISMATCH = 460
 """Status of a wrong checksum in the tus protocol."""
@@ -93,6 +94,13 @@ class ApiError(Exception):
         self.kind, self.detail, self.headers = kind, detail, dict(headers or {})
 
 
+def found_in_project(found: T | None, identifier: str) -> T:
+    """Return what was found of an identifier; refuse the request where that is nothing, or another project's."""
+    if found is None:
+        raise ApiError("not-found", f"there is no {identifier} in this project")
+    return found
+
+
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the problems that a route may answer with, for the OpenAPI document."""
     return {status: {"model": Problem, "description": KINDS[OF_STATUS[status]].title} for status in statuses}
@@ -119,11 +127,14 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def routed(request: Request, error: HTTPException) -> Response:
         kind, headers = OF_STATUS.get(error.status_code, "bad-request"), dict(error.headers or {})
-        if error.status_code == KINDS["method-not-allowed"].status:
-            path = request.scope["path"]  # the router names the methods of its first route alone
+        path, detail = request.scope["path"], str(error.detail or HTTPStatus(error.status_code).phrase)
+        if detail == HTTPStatus.NOT_FOUND.phrase:  # of the router, which knows no more
+            detail = f"nothing has the address {path}"
+        if error.status_code == KINDS["method-not-allowed"].status:  # the router names the methods of its first route alone
             found = (route.methods or () for route in iter_route_contexts(request.app.routes) if route.path_regex.match(path))
             headers["Allow"] = ", ".join(sorted({method for methods in found for method in methods}))
-        return answer(request, kind, str(error.detail or HTTPStatus(error.status_code).phrase), headers=headers)
+            detail = f"{path} takes {headers['Allow']}, and not {request.method}"
+        return answer(request, kind, detail, headers=headers)
 
     @app.exception_handler(StorageError)
     async def full(request: Request, error: StorageError) -> Response:

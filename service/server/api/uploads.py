@@ -13,7 +13,7 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UploadId, pa
 from service.server.api import tus
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
-from service.server.api.problems import ApiError, responses
+from service.server.api.problems import ApiError, found_in_project, responses
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled, too_long
 from service.server.base.safe_names import check_path, shown
 from service.server.database import audit, idempotency, intakes, quotas, uploads
@@ -202,10 +202,7 @@ def _hold(service: Service, caller: Caller, connection: sa.Connection, intake: s
 
 
 def _row(service: Service, caller: Caller, upload: str) -> Row:
-    row = uploads.find(service.database, upload, caller.project)
-    if row is None:
-        raise ApiError("not-found", f"there is no {upload} in this project")
-    row = settled(service, row)
+    row = settled(service, found_in_project(uploads.find(service.database, upload, caller.project), upload))
     if _expired(service, row):
         raise ApiError("gone", f"{upload}: nothing came for {service.settings.upload_hours:g} hours: begin it again")
     return row

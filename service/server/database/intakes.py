@@ -48,7 +48,7 @@ def time_steps(intake: sa.RowMapping | None) -> int:
     return int(facts.get("steps", captures if captures > 1 else 0))  # "steps" is not among the facts of older checks
 
 
-def latest(database: Database, project: str, kind: str, *, limit: int, before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
+def latest(database: Database, project: str, kind: str, *, limit: int, before: sa.RowMapping | None = None) -> list[sa.RowMapping]:
     """Return a page of the intakes of a project, the newest first; `before` is that of `jobs.latest`."""
     query = sa.select(intakes).where(intakes.c.project == project, intakes.c.kind == kind)
     return database.rows(newest_first(query, intakes, limit=limit, before=before))

@@ -70,8 +70,8 @@ def find(database: Database, job: str, project: str | None = None) -> sa.RowMapp
 
 
 def latest(database: Database, project: str, *, states: Sequence[str] = (), kinds: Sequence[str] = (), limit: int,
-           before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
-    """Return a page of the jobs of a project, the newest first; `before` has time and identifier of the last of the page before."""
+           before: sa.RowMapping | None = None) -> list[sa.RowMapping]:
+    """Return a page of the jobs of a project, the newest first; `before` is the last of the page before."""
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
         query = query.where(jobs.c.state.in_(states))

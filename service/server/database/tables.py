@@ -183,8 +183,8 @@ clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's
     sa.Column("waits_s", sa.Float, nullable=False))  # seconds for which nothing is removed for its age, after a jump
 
 
-def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
-    """Return the query of one page of rows, the newest first; `before` has creation time and identifier of the last of the page before."""
+def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: sa.RowMapping | None) -> "sa.Select[Any]":
+    """Return the query of one page of rows, the newest first; `before` is the last row of the page before."""
     if before is not None:
-        query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(*before))
+        query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(before["created_at"], before["id"]))
     return query.order_by(table.c.created_at.desc(), table.c.id.desc()).limit(limit)

@@ -9,7 +9,6 @@ import json
 import posixpath
 import re
 from functools import cache
-from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -161,8 +160,6 @@ def wants_page(request: Request) -> bool:
 
 def fault_page(request: Request, status: int, title: str, detail: str) -> Response:
     """Return a page that says in one sentence why there is nothing else to show."""
-    if detail == HTTPStatus.NOT_FOUND.phrase:  # of the router, which knows no more
-        title, detail = "There is nothing here", f"no page has the address {request.url.path}"
     sentence = f"{detail[:1].upper()}{detail[1:]}".rstrip(".") + "."
     page = _page(request, "fault.html", title=title, sentence=sentence, status=status, request_id=getattr(request.state, "request_id", ""))
     page.status_code = status
