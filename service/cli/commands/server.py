@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from service.cli.progress import ProgressBar
+
 ConfigOption = Annotated[Path | None, typer.Option(
     "--config", metavar="FILE.toml", show_default=False,
     help="File of settings, which docs/service.md lists. A variable RELIT_… of the environment overrides it.")]
@@ -87,7 +89,8 @@ def backup(
     from service.server.process.backup import backup as run
 
     settings = settings_of(config, data=data)
-    made = run(settings, out, copy_objects=objects)
+    with ProgressBar() as bar:
+        made = run(settings, out, copy_objects=objects, progress=bar)
     print(f"backup   {made.folder}")
     print(f"files    {made.files}, {made.size} bytes")
     if settings.storage_url is not None:
@@ -106,7 +109,8 @@ def restore(
     from service.server.process.backup import restore as run
 
     settings = settings_of(config, data=data)
-    made = run(settings, folder, accept_differences=accept_differences)
+    with ProgressBar() as bar:
+        made = run(settings, folder, accept_differences=accept_differences, progress=bar)
     print(f"data     {settings.data}")
     print(f"files    {made.files}, {made.size} bytes, as their checksums say")
     if made.objects:

@@ -16,17 +16,18 @@ import shutil
 import sqlite3
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import unquote, urlsplit
 
 import sqlalchemy as sa
 
 from service import __version__
 from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
 from service.requests.states import ACTIVE
 from service.server.base.settings import Settings
 from service.server.database import tables
@@ -39,6 +40,9 @@ from service.server.storage.objects import TRANSFERS
 from stage.errors import StorageError, storage
 from stage.files import write_text
 
+T = TypeVar("T")
+UNTOLD = Timings()
+"""The progress that nobody looks at."""
 PROJECTS = "projects"
 """Folder of captures and results, in the data folder and in the backup, and prefix of their objects."""
 TRIES = 5
@@ -100,8 +104,9 @@ class Backup(NamedTuple):
     """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
 
 
-def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
+def backup(settings: Settings, out: Path, *, copy_objects: bool = False, progress: Progress = UNTOLD) -> Backup:
     """Copy a service, which may run meanwhile, to a new folder; objects of `storage_url` are named unless `copy_objects` is set."""
+    progress.stage("database", 1)
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")
     if out.resolve().is_relative_to(settings.data):
@@ -126,13 +131,14 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     if settings.storage_url is None:
         folders[settings.data / PROJECTS] = _link
     for folder, keep in folders.items():
-        for path in _files(folder):
+        for path in _told(progress, folder.name, list(_files(folder))):
             name = path.relative_to(settings.data).as_posix()
             if keep(path, out / name):
                 found[name] = _entry(out / name)
     contents: dict[str, Any] = {"schema": SCHEMA, "version": __version__, "at": at, "files": found}
     objects: dict[str, Object] = {}
     if bucket is not None:
+        progress.stage("objects", 1)
         objects = save(bucket, out / OBJECTS) if copy_objects else present(bucket, pieces=False)
         active |= _active_jobs(settings)
         contents["storage"] = {"url": bucket.url, "copied": copy_objects, "objects": {
@@ -144,7 +150,7 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     return Backup(out, len(found), sum(entry["size"] for entry in found.values()), len(objects), copy_objects)
 
 
-def restore(settings: Settings, folder: Path, *, accept_differences: bool = False) -> Backup:
+def restore(settings: Settings, folder: Path, *, accept_differences: bool = False, progress: Progress = UNTOLD) -> Backup:
     """Make a service from a backup, in an empty data folder and database; `accept_differences`: the store may hold other objects."""
     files, stored = _contents(folder)
     kind = SQLITE if settings.is_sqlite else DUMP
@@ -158,13 +164,14 @@ def restore(settings: Settings, folder: Path, *, accept_differences: bool = Fals
             has_tables = bool(sa.inspect(database.engine).get_table_names())
         if has_tables:
             raise RequestError("database_url: the database has tables already: give an empty one")
-    for name, entry in files.items():
+    for name, entry in _told(progress, "check", files.items()):
         if not (folder / name).is_file() or _entry(folder / name) != entry:
             raise RequestError(f"{folder / name}: is missing or differs from its checksum: the backup is damaged")
+    progress.stage("objects", 1)
     differing = _restore_objects(settings, folder, files, stored, accept_differences=accept_differences)
     with storage("make", settings.data):
         settings.data.mkdir(parents=True, exist_ok=True)
-    for name in files:
+    for name in _told(progress, "files", files):
         if name not in (SQLITE, DUMP) and not name.startswith(f"{OBJECTS}/"):
             _copy(folder / name, settings.data / name)
     if settings.is_sqlite:
@@ -174,6 +181,14 @@ def restore(settings: Settings, folder: Path, *, accept_differences: bool = Fals
                   str(urlsplit(str(settings.database_url)).path.lstrip("/")), str(folder / DUMP))
     return Backup(folder, len(files), sum(entry["size"] for entry in files.values()), 0 if stored is None else len(stored["objects"]),
                   stored is not None and stored["copied"], differing)
+
+
+def _told(progress: Progress, stage: str, items: Collection[T]) -> Iterator[T]:
+    """Yield items of a stage, and tell how many are done."""
+    progress.stage(stage, max(len(items), 1))
+    for done, item in enumerate(items, 1):
+        yield item
+        progress.advance(done)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import pytest
 from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.process.backup import CONTENTS, backup, restore
+from tests.service.recording import Recording, Stage
 from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
 from tests.service.server.jobs.harness import harness
 
@@ -49,7 +50,9 @@ def saved(tmp_path):
         folder.mkdir(parents=True)
         (folder / "maps.exr").write_bytes(b"maps")
         (folder / ".maps.exr.part").write_bytes(b"ma")
-        backup(made.settings, tmp_path / "saved")
+        told = Recording()
+        backup(made.settings, tmp_path / "saved", progress=told)
+        assert Stage("projects", 1, [1]) in told.stages and not told.faults
     return tmp_path / "saved"
 
 
