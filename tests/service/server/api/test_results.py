@@ -16,13 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.server.api import results as routes
 from service.server.api.problems import ApiError
 from service.server.api.results import asked_range, tag_matches
 from service.server.base.settings import Settings
 from service.server.storage.folder import FolderStorage, OpenFile
 from stage.errors import StorageError
 from stage.formats import exr
+from stage.results import small_picture
 from tests.service.server.api.asgi import Call, app_of
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import ENDED, NOBODY, finish, finished, made_by, refused, report_of, result, submit
@@ -262,7 +262,7 @@ def test_pictures_are_made_of_whole_images_of_known_colours_and_bounded_size(tmp
         shown = oiio.ImageBuf(str(tmp_path / "shown.jpg")).get_pixels(oiio.FLOAT)
         assert shown.shape == (300, 150, 3)  # one of two in a row, so that the longest side is at most 512
         assert np.abs(shown - (0.735 + 0.5 * 0.2)).max() < 0.01  # 0.5 as sRGB encodes it, over grey; eight bits and JPEG
-        monkeypatch.setattr(routes, "MOST_VALUES", 4 * 600 * 300)
+        monkeypatch.setattr(small_picture, "MOST_VALUES", 4 * 600 * 300)
         assert {name: answer(name).status for name in ("large.exr", "cut.exr", "odd.exr", "many.exr", "../large.exr", "no.exr")} == {
             "large.exr": 200, "cut.exr": 422, "odd.exr": 422, "many.exr": 422, "../large.exr": 404, "no.exr": 404}
 
