@@ -1,5 +1,6 @@
 """Lines that several commands print, and what the commands that take a sequence of captures check."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,11 @@ def print_warnings(warnings: Sequence[str]) -> None:
     """Print a line for each thing that does not fit."""
     for sentence in warnings:
         print(f"warning  {sentence}")
+
+
+def tell(sentence: str) -> None:
+    """Print a sentence beside the output, while the command goes on."""
+    print(f"relit: {sentence}", file=sys.stderr, flush=True)
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli.printing import tell
+
 if TYPE_CHECKING:
     from service.client import Client
 
@@ -32,7 +34,7 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
     from service.errors import RequestError
 
     try:
-        with Client(server, key, on_silence=lambda words: print(f"relit: {words}", file=sys.stderr)) as client:
+        with Client(server, key, on_silence=tell) as client:
             yield client
     except ClientError as error:
         raise RequestError(str(error)) from error
@@ -47,14 +49,14 @@ def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrup
         with ProgressBar() as bar:
             ended = client.jobs.wait(job, progress=bar)
     except JobEnded as error:
-        print(f"relit: {error}", file=sys.stderr)
+        tell(str(error))
         raise typer.Exit(UNSUCCESSFUL) from error
     except KeyboardInterrupt:
         if cancel_on_interrupt:
             client.jobs.cancel(job)
-            print(f"relit: interrupted; {job} is cancelled", file=sys.stderr)
+            tell(f"interrupted; {job} is cancelled")
         else:
-            print(f"relit: interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it", file=sys.stderr)
+            tell(f"interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it")
         sys.exit(INTERRUPTED)
     if ended.started_at is not None and ended.finished_at is not None:
         print(f"state       {ended.state}, {(ended.finished_at - ended.started_at).total_seconds():.1f} s")

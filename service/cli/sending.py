@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 from service.acquisition.capture_files import JOURNAL_FILE
+from service.cli.printing import tell
 from service.client import Client, ClientError
 from service.errors import RequestError
 from service.requests.states import READY
@@ -25,7 +26,7 @@ class Sender:
         """Take note of the address of a service and the folder of a capture; nothing is sent yet.
         Raises RequestError: the address is none of a service."""
         try:
-            self._client = Client(server, os.environ.get(KEY_VARIABLE))
+            self._client = Client(server, os.environ.get(KEY_VARIABLE), on_silence=tell)
         except ClientError as error:
             raise RequestError(f"--to {server}: {error}") from error
         self._server, self._folder = server, folder

@@ -204,7 +204,7 @@ def identifier(out: str) -> str:
 @pytest.mark.long
 def test_pictures_are_sent_as_they_are_taken_and_the_capture_is_whole_after_the_last(capture, stage, tmp_path, client, monkeypatch):
     made, between = [], Between()  # the command's own network
-    monkeypatch.setattr("service.cli.sending.Client", lambda url, key: Client(url, key, transport=between))
+    monkeypatch.setattr("service.cli.sending.Client", lambda url, key, **more: Client(url, key, transport=between, **more))
     release = stage.release
 
     def noted() -> None:
@@ -240,8 +240,9 @@ def test_a_capture_that_was_cut_off_goes_on_with_its_upload(capture, stage, clie
 
 
 def test_a_service_that_is_not_there_is_said_before_a_lamp_is_on(capture, stage, monkeypatch, tmp_path):
-    monkeypatch.setattr("service.cli.sending.Client", lambda url, key: Client(url, key, patience_s=0.1))
-    capture(to="http://127.0.0.1:9").refused("--to http://127.0.0.1:9: ")
+    monkeypatch.setattr("service.cli.sending.Client", lambda url, key, **more: Client(url, key, patience_s=0.3, **more))
+    said = capture(to="http://127.0.0.1:9").err.splitlines()
+    assert "asked again for 0 s" in said[0] and "--to http://127.0.0.1:9: " in said[-1]  # at once, and when the patience is over
     capture(to="nowhere").refused("--to nowhere: nowhere: is no URL of a service")
     assert stage.released == 0 and stage.on == set()
     monkeypatch.setenv("RELIT_KEY", "wrong")
@@ -259,7 +260,7 @@ def test_a_service_that_is_lost_ends_no_capture(capture, stage, tmp_path, client
             raise httpx2.ConnectError("unplugged")
         return send()
     between.breaks = lost
-    monkeypatch.setattr("service.cli.sending.Client", lambda url, key: Client(url, key, patience_s=0.1, transport=between))
+    monkeypatch.setattr("service.cli.sending.Client", lambda url, key, **more: Client(url, key, patience_s=0.1, transport=between, **more))
     outcome = capture()
     assert outcome.code == 2 and "whole here: run the same command again to send the rest" in outcome.err
     assert len(list((tmp_path / "capture").glob("*.exr"))) == LAMPS + 1
