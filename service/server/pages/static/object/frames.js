@@ -4,6 +4,7 @@ import { attempt, fetched, listing, read, Refusal, warningsIn } from "../api.js"
 import { bytes, element, icon } from "../element.js";
 import { once } from "../once.js";
 import { savingLink } from "./files.js";
+import { warningsOf } from "./results.js";
 import { offerVideo } from "./video.js";
 
 const FRAME = /^(.*\/)?frame\.\d+\.exr$/;
@@ -12,8 +13,8 @@ const PARALLEL = 3;
 const UNREADABLE = "The browser cannot read it.";
 const STRIP_PX = 72; // height of the pictures of the filmstrip
 
-/** Show the frames of a job, by its identifier, and load their pictures for as long as the place is on the page. */
-export async function mountFrames(place, job) {
+/** Show the frames of a job, by its identifier, and load their pictures for as long as the place is on the page; `assumed`: of its capture. */
+export async function mountFrames(place, job, assumed) {
   const frames = [];
   for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
   const warnings = warningsIn((await read(`/v1/jobs/${job}/log`)).entries);
@@ -128,7 +129,7 @@ export async function mountFrames(place, job) {
   strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",
     onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
   place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told), element("p", { class: "actions" }, again)),
-    tools, element("ul", { class: "warnings plain" }, ...warnings.map((each) => element("li", {}, each))), strip, files);
+    tools, warningsOf({ info: { findings: [], warnings, assumed: assumed.filter((each) => warnings.includes(each)) } }), strip, files);
   const waiting = frames.map((_, index) => index);
   const loaders = Array.from({ length: PARALLEL }, () => async () => {
     for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next);

@@ -35,7 +35,7 @@ export function modesOf(identifier, view, step, jobs, facts, environments, submi
   modes["3d"] = ofJobs("3-D", exported, mountAsset);
   if (view.info.frames.length > 0) modes.photographs = { title: "Photographs", mount: (parent) => mountPhotographed(parent, view) };
   modes.depth = ofJobs("Depth", measured, maps);
-  modes.frames = ofJobs("Frames", relit, (parent, job) => mountFrames(parent, job.id));
+  modes.frames = ofJobs("Frames", relit, (parent, job) => mountFrames(parent, job.id, view.info.assumed ?? []));
   for (const [each, compared] of [["compare", solved], ["compare-depths", measured]]) {
     if (compared.length > 1) modes[each] = { title: each === "compare" ? "Compare" : "Compare depths", job: compared[0].id, mount: (parent) => mountCompared(parent, compared) };
   }

@@ -11,7 +11,7 @@ import pytest
 from stage.formats import exr
 from tests.reference.colour import srgb
 from tests.service.server.api.job_calls import refused
-from tests.service.server.pages.conftest import done, expect
+from tests.service.server.pages.conftest import alter, done, expect
 
 pytestmark = pytest.mark.long
 
@@ -113,6 +113,15 @@ def test_a_picture_that_does_not_come_is_said_in_words_and_asked_for_again(page,
     page.wait_for_function(f"(before) => ({LOOK})() !== before", arg=before)  # it is not held up by the one that cannot be read
     expect(page.locator(".filmstrip li:nth-child(4) .icon")).to_have_count(1)
     expect(page.locator(".frames-picture.missing")).to_have_count(0)
+
+
+def test_what_was_taken_for_granted_is_no_warning_of_frames(page, solved, relit):
+    alter(page, "**/results/view.json", lambda view: view | {"assumed": ["no lens is known"]})
+    alter(page, f"**/v1/jobs/{relit}/log", lambda log: {"entries": [
+        *log["entries"], {**log["entries"][-1], "text": "warning: no lens is known"}]})
+    page.goto(f"{solved.pages['object']}#mode=frames")
+    expect(page.locator("[data-shows=frames] .assumed li")).to_have_text(["no lens is known"])
+    expect(page.locator("[data-shows=frames] .warnings")).not_to_contain_text("no lens")
 
 
 def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
