@@ -30,6 +30,9 @@ EDGE_MARGIN = 0.01
 MISSED_PX = 0.05
 """Largest residual, in projector pixels, of a point found from one axis. With one axis an exact point exists, so that steps with a larger
 residual have not converged."""
+MISSED_SIGMAS = 3.0
+"""Standard deviations of the decoded place by which it may always lie from the point's: coarse codes, such as ramps, scatter farther than
+`max_residual_px`."""
 MIN_SIGMA_PX = 1.0e-3
 """Least standard deviation of a coordinate, projector pixels, so that a given one of zero does not take all the weight."""
 
@@ -139,6 +142,7 @@ def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weigh
     at = project(g, a, s)
     off_u, off_v = wp.where(weight_u > 0.0, at.u - u, 0.0), wp.where(weight_v > 0.0, at.v - v, 0.0)
     miss = wp.sqrt(off_u * off_u + off_v * off_v)
+    explained = weight_u * off_u * off_u + weight_v * off_v * off_v <= MISSED_SIGMAS * MISSED_SIGMAS
     slope = weight_u * at.du * at.du + weight_v * at.dv * at.dv
     way_u, way_v = wp.where(weight_u > 0.0, at.du, 0.0), wp.where(weight_v > 0.0, at.dv, 0.0)
     parallax = wp.abs(s) * wp.sqrt(way_u * way_u + way_v * way_v)
@@ -149,7 +153,7 @@ def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weigh
     lit = at.u > -edge_u and at.u < g.size[0] + edge_u and at.v > -edge_v and at.v < g.size[1] + edge_v
     both = weight_u > 0.0 and weight_v > 0.0
     depth = 1.0 / wp.max(s, 1.0e-12)
-    if (s <= 0.0 or at.ahead <= 0.0 or at.fold <= 0.0 or not lit or miss > wp.where(both, limit, MISSED_PX)
+    if (s <= 0.0 or at.ahead <= 0.0 or at.fold <= 0.0 or not lit or (miss > wp.where(both, limit, MISSED_PX) and not (both and explained))
             or depth < near or depth > far):
         found.status = _OUT_OF_RANGE
         return found
@@ -186,7 +190,8 @@ def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Dec
         x, y: [pixels] where each line of sight crosses z = -1 of the camera frame, lens distortion undone, y up: (x, y, -1) is along it.
         columns, rows: the decoded column u and row v, or None; where both axes are decoded both count, weighted by 1/σ².
         near_m, far_m: range of depths outside which a result is OUT_OF_RANGE.
-        max_residual_px: with both axes, how far the decoded place may lie from the point's; beyond, it is OUT_OF_RANGE.
+        max_residual_px: with both axes, how far the decoded place may lie from the point's; beyond that, and beyond three of its standard
+            deviations, it is OUT_OF_RANGE.
 
     Raises:
         ArrayError: neither axis is given, or the counts of pixels differ.

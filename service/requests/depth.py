@@ -91,7 +91,7 @@ class DepthOptions(PixelOptions):
     """Farthest depth in metres; pixels above have the status out of range."""
     max_residual_px: Positive = 4.0
     """Where both column and row are decoded: how many projector pixels the decoded place may be away from where the projector sees the
-    triangulated point."""
+    triangulated point, or three of its standard deviations if these are more."""
     refine: bool = True
     """Interpolate a Gray code with inverses between the edges of its stripes."""
     refine_projector: bool = False

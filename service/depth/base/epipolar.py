@@ -179,7 +179,8 @@ def _turned(projector: Projector, part: np.ndarray) -> Projector:
 
 
 def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, deviations: np.ndarray, *, least_px: float,
-                  alike: float = 1.0, free: int = VIEW, typed: bool = True, before: Contradiction | None = None) -> Contradiction | None:
+                  least_part: float = 0.0, alike: float = 1.0, free: int = VIEW, typed: bool = True,
+                  before: Contradiction | None = None) -> Contradiction | None:
     """Return how the places of points contradict the calibration of a view, None where noise explains them.
 
     Args:
@@ -188,6 +189,7 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
         places: [points, 2] measured columns and rows in the view, continuous pixels.
         deviations: [points, 2] their standard deviations.
         least_px: least systematic distance from the epipolar lines that is one.
+        least_part: the same as a part of the median distance that the fit leaves.
         alike: number of neighbours whose errors are counted as one.
         free: number of the first parameters that are fitted; the others are as they were given.
         typed: whether a principal point may be typed wrongly, which a turn about the same axis looks like.
@@ -222,18 +224,18 @@ def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, 
     for _ in range(LAST_ROUNDS):
         part, covariance, weight = fitted()
     left = off - slopes @ part
-    size = float(np.sqrt(np.mean((slopes @ part)**2)))
+    size, noise = float(np.sqrt(np.mean((slopes @ part)**2))), float(np.median(np.abs(left)))
     gain = float((weight * (off**2 - left**2)).sum())
     sure = True
     if free < VIEW:  # others may be wrong too, as far as whole blocks of the image say
         ahead = points[chosen, :2] / points[chosen, 2:]
         covariance = covariance + between_blocks(covariance, slopes * (weight * left)[:, None], *ahead.T)
         sure = float(part[:free] @ np.linalg.solve(covariance[:free, :free], part[:free])) > LEAST_SQUARE
-    if before is None and (size < least_px or gain < LEAST_GAIN or not sure):
+    if before is None and (size < max(least_px, least_part * noise) or gain < LEAST_GAIN or not sure):
         return None
     found = _turned(projector, np.clip(part, -LARGEST, LARGEST) * PRIOR)
     aside = {} if before is not None or not typed else _aside((every * weight[:, None]).T @ every, (every * weight[:, None]).T @ off)
-    return Contradiction(size, float(np.median(np.abs(left))), projector, found, part, covariance, so_far + part, aside)
+    return Contradiction(size, noise, projector, found, part, covariance, so_far + part, aside)
 
 
 def _aside(matrix: np.ndarray, right: np.ndarray) -> dict[int, tuple[np.ndarray, np.ndarray]]:

@@ -58,6 +58,9 @@ ALIKE = 9.0
 """Number of neighbours whose errors are counted as one, as those of one stripe are."""
 LEAST_PX = 0.1
 """Least systematic distance from the epipolar lines that is one, which good calibrations and uneven stripes do not reach."""
+OF_STRIPES, OF_WIDE = 0.25, 1.0
+"""The same as a part of the distance that is left. Light that bounces between surfaces moves a ramp, or a wave as wide as half of the
+projector, by up to a hundredth of it, alike over whole parts of the image: right ones in corners, on stairs and on waves left up to .66."""
 
 
 def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera: Camera, projector: Projector, device: str) -> np.ndarray:
@@ -147,12 +150,13 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
 
 
 def contradicted(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, projector: Projector,
-                 before: Contradiction | None) -> Contradiction | None:
+                 before: Contradiction | None, *, wide: bool) -> Contradiction | None:
     """Return how columns and rows contradict a projector; None where they do not.
-    `before`: the contradiction by which the projector was found."""
+    `before`: the contradiction by which the projector was found. `wide`: whether an axis is coded by wide patterns alone."""
     judged = _judged(solution, u, v)
     return contradiction(projector, camera.points(-solution.depth)[judged], np.stack([u.coordinate[judged], v.coordinate[judged]], axis=1),
-                         np.stack([u.sigma[judged], v.sigma[judged]], axis=1), least_px=LEAST_PX, alike=ALIKE, before=before)
+                         np.stack([u.sigma[judged], v.sigma[judged]], axis=1), least_px=LEAST_PX, alike=ALIKE, before=before,
+                         least_part=OF_WIDE if wide else OF_STRIPES)
 
 
 def widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, camera: Camera, found: Contradiction, declared: Projector) -> None:

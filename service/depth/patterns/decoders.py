@@ -101,6 +101,10 @@ class AxisDecoder:
     made: EvenLight | None = None
     """The rule that makes white and black of phases, where it needs them and the capture has none."""
 
+    def wide(self, extent: int) -> bool:
+        """Return whether it reads a ramp, or waves of half the extent of the projector and more, alone."""
+        return all(isinstance(code, RampCode) or (isinstance(code, PhaseCode) and min(code.periods_px) >= extent / 2) for code in self.used)
+
 
 @dataclass(frozen=True)
 class AxisCodes:

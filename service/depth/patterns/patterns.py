@@ -251,8 +251,9 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
     def measure(view: Projector, before: Contradiction | None) -> tuple[Measured, Contradiction | None]:
         found = _triangulated(planes, mask, codes, coordinates, view, capture, frames, noise, device, request, timings, declared=declared)
         u, v = coordinates.columns, coordinates.rows
-        return found, None if u is None or v is None else contradicted(found.solution, u, v, capture.camera, view, before)
+        return found, None if u is None or v is None else contradicted(found.solution, u, v, capture.camera, view, before, wide=wide)
 
+    wide = any(axis is not None and axis.wide(size) for axis, size in zip((codes.columns, codes.rows), projector.resolution, strict=True))
     _, found, contradiction = settled(projector, measure, refine=request.refine_projector and declared)
     if contradiction is not None:
         u, v = coordinates.columns, coordinates.rows

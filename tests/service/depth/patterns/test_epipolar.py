@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.depth.base.epipolar import contradiction
-from service.depth.patterns.agreement import ALIKE, LEAST_PX
+from service.depth.patterns.agreement import ALIKE, LEAST_PX, OF_WIDE
 from stage.capture.projector import Projector
 from tests.marks import first_short
 from tests.scenes.captures import edit_manifest, write_images, write_manifest
@@ -81,6 +81,18 @@ def judged(rig, wrong, noise, *, stripes=0.0, seed=3):
 def test_right_calibrations_raise_no_doubt(rig, stripes):
     for seed in range(4):
         assert judged(rig, None, 0.06, stripes=stripes, seed=seed)[0] is None
+
+
+def test_light_that_pulls_ramps_towards_their_middle_is_no_calibration():
+    """Bounced light adds a hundredth of a ramp's mean, and noise is coarser: a projector that is turned by more is told all the same."""
+    points, pose, uv = scene("right", 3)
+    for wrong, pull in ((None, 0.01), ("roll", 0.0)):
+        projector = declared(pose, wrong)
+        ramps = uv + pull * (np.array(PROJECTED) / 2 - uv) + np.random.default_rng(3).normal(0, 0.9, uv.shape)
+        flat = triangulated(points, ramps, projector).reshape(-1, 3)
+        told = [contradiction(Projector.model_validate(projector), flat, ramps.reshape(-1, 2), np.full((len(flat), 2), 0.9),
+                              least_px=LEAST_PX, least_part=part, alike=ALIKE) is not None for part in (0.0, OF_WIDE)]
+        assert told == [True, wrong is not None]
 
 
 @pytest.mark.parametrize("wrong", WRONG)
