@@ -58,18 +58,27 @@ class FrameShifts(NamedTuple):
 
     shift: np.ndarray  # [compared frames] camera pixels, of mean 0
     deviation: np.ndarray  # [compared frames] camera pixels
+    beside_steps: np.ndarray  # [compared frames] the same where edges may lie beside steps of the surface
     time: np.ndarray  # [compared frames] places in the sequence
 
     @property
     def clear(self) -> bool:
-        """Return whether images have shifted."""
-        others = ~np.eye(len(self.shift), dtype=bool)
-        return self._away(slice(None)) > CLEAR_SIGMAS and all(
-            np.ptp(self.shift[kept]) > CLEAR_PX and self._away(kept) > OTHERS_SIGMAS for kept in others)
+        """Return whether images have shifted, or edges of wide stripes lie beside steps, as on stairs."""
+        return self._differ(self.deviation)
 
-    def _away(self, kept: np.ndarray | slice) -> float:
+    @property
+    def sure(self) -> bool:
+        """Return whether images have shifted, whatever steps the surface has."""
+        return self.clear and self._differ(self.beside_steps)
+
+    def _differ(self, deviation: np.ndarray) -> bool:
+        others = ~np.eye(len(self.shift), dtype=bool)
+        return self._away(deviation, slice(None)) > CLEAR_SIGMAS and all(
+            np.ptp(self.shift[kept]) > CLEAR_PX and self._away(deviation, kept) > OTHERS_SIGMAS for kept in others)
+
+    def _away(self, deviation: np.ndarray, kept: np.ndarray | slice) -> float:
         """Return by how many standard deviations some of the shifts differ from their mean, all together."""
-        shift, weight = self.shift[kept], 1 / self.deviation[kept] ** 2
+        shift, weight = self.shift[kept], 1 / deviation[kept] ** 2
         return float(np.sqrt((weight * (shift - np.average(shift, weights=weight)) ** 2).sum()))
 
     def over(self, frames: int) -> float:
@@ -88,7 +97,8 @@ def widen_shifted(planes: Planes, coordinates: Coordinates, decoders: Sequence[A
         found = find_shifts(planes, axis, decoder, collected, frames, across)
         if found is None or not found.clear:
             return None
-        coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
+        if found.sure:
+            coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
         return found.over(len(frames)) * _slope(axis, across)
 
     wider = coordinates.widen(decoders, off)
@@ -242,8 +252,12 @@ def _solve(edges: np.ndarray, usual: float, time: np.ndarray) -> FrameShifts | N
     if weight.mean() < FITTING:
         return None
     deviation = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ (weight[:, None] * design))))[:-1]
-    # an edge of the projector seems to lie elsewhere by where it lies between the pixels, and alike on every line of a surface that faces
-    # the camera
-    places = [max(len(np.unique(at[1:-1][even & (here[1:-1] == each)])), 1) for each in np.flatnonzero(told)]
+    # an edge of the projector seems to lie elsewhere by where it lies between the pixels, and beside a step or a crease of the surface, and
+    # alike on every line that crosses both
+    edge, group = np.unique(np.stack([here[1:-1][even][whole], at[1:-1][even][whole]]), axis=1, return_inverse=True)
+    places = np.maximum(np.bincount(edge[0].astype(int), minlength=len(time))[told], 1)
+    several = np.bincount(group, weight)
+    off = np.bincount(group, weight * rest) / several
+    beside = np.sqrt(max(float(np.mean(off**2 - spread**2 / several)), 0.0) / places)
     deviation = np.hypot(deviation, edge_error_of(whole_pixels.mean()) / np.sqrt(places))
-    return FrameShifts(shift[:-1] - shift[:-1].mean(), deviation, time[told])
+    return FrameShifts(shift[:-1] - shift[:-1].mean(), deviation, np.hypot(deviation, beside), time[told])

@@ -46,6 +46,14 @@ def test_a_camera_that_stands_still_is_not_accused(tmp_path, light, name):
     assert said == [] and size == 0
 
 
+def test_stairs_before_a_camera_that_stands_still_are_not_accused(tmp_path):
+    """The few edges of wide stripes lie beside steps, on every line alike; 1.3 px were said of these."""
+    steps = [Wall((0.07 * number, 0, -1.25 - 0.05 * ((number + 2) % 3)), (0, 0, 1), 0.7, half_m=(0.035, 1)) for number in range(-8, 9)]
+    stairs = World(shapes=(Wall((0, 0, -1.4), (0, 0, 1), 0.7), *steps), rig=RIG, samples=2)
+    write_capture(tmp_path, stairs, PATTERNS["Gray"])
+    assert not depth_of(tmp_path, read_noise=stairs.read_noise, photon_gain=1 / stairs.electrons).warnings
+
+
 @every_code
 def test_a_camera_that_drifts_is_named_and_sigma_holds_it(tmp_path, light, name):
     """Frames with wide stripes, half of the sequence or more, show at least a third of the drift and at most all of it."""
