@@ -91,7 +91,7 @@ class Manifest(Strict):
     """An image of an evenly lit white card, by which images are divided; None: none."""
     saturation: Positive | None = None
     """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
-    frames of lights alone."""
+    frames of lights, phases and ramps alone."""
     color_matrix: Annotated[ColorMatrix, AfterValidator(_invertible)] | None = None
     """The matrix, by rows, from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
     of a camera raw file, as `relit calibrate white-balance` measures it. None: the colours are used as they are."""

@@ -27,6 +27,9 @@ MEMORY_BYTES = 256 << 20
 """The most bytes of planes that are kept in memory; larger planes lie in a scratch file."""
 BAND_BYTES = 64 << 20
 """The bytes of the planes in one band; a decoder needs a few times that beside them."""
+WAVES = ("phase", "modulated", "ramp")
+"""Codes of which a reading measures light: one that is clipped moves their places, where stripes are bright all the same. Their largest
+integer is saturated where no saturation is given."""
 DECODE_BYTES, BYTES_PER_PIXEL = 1 << 30, 56
 """The bytes that all images which are corrected at one time may take, and the bytes of each of their pixels."""
 
@@ -36,7 +39,7 @@ class Planes:
     """The corrected frames that `frame_planes` was called with, in their order."""
 
     values: np.ndarray  # [frames, rows, channels, cols] float32, linear radiance; channels 1 (grey) or 3
-    saturated: np.ndarray | None  # [frames, rows, cols] bool; None when the manifest gives no saturation
+    saturated: np.ndarray | None  # [frames, rows, cols] bool; None where no reading is
     exposure: np.ndarray | None = None
     """[rows, cols] float32, the light that each pixel has gathered, over that of the longest; None: all alike. Bands of the frames are
     multiplied by it, so that one noise model holds for all pixels."""
@@ -70,26 +73,29 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
         progress: called after every frame with the count of frames that have been read.
         joined: how each frame is joined of several exposures; None: they are read as they are.
     """
-    read_frame = Correction.of(capture).apply if joined is None else joined.read
+    read_frame = Correction.of(capture, full_scale=True).apply if joined is None else joined.read
     marked = joined is not None or capture.manifest.saturation is not None
+    waves = [getattr(frame.pattern, "code", None) in WAVES for frame in frames]
     width, height = capture.camera.resolution
     shape = (len(frames), height, 3 if colour else 1, width)
     with scratch_arrays(4 * int(np.prod(shape)), capture, cache) as allocate:
         values = allocate(shape, np.float32)
-        saturated = allocate((len(frames), height, width), np.bool_) if marked else None
+        saturated = allocate((len(frames), height, width), np.bool_) if marked or any(waves) else None
 
         def read(index: int) -> None:
             radiance = read_frame(frames[index])
             pixels = radiance.pixels if colour else radiance.pixels @ np.array(GREY_WEIGHTS, np.float32)[:, None]
             values[index] = np.moveaxis(pixels, 2, 1)
             if saturated is not None:
-                saturated[index] = radiance.saturated
+                saturated[index] = radiance.saturated if (marked or waves[index]) and radiance.saturated is not None else False
 
         at_once = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * math.prod(capture.image_resolution))))
         with ThreadPoolExecutor(at_once, thread_name_prefix="relit-planes") as pool:
             for done, _ in enumerate(pool.map(read, range(len(frames))), start=1):
                 if progress is not None:
                     progress(done)
+        if not marked and saturated is not None and not saturated.any():
+            saturated = None
         yield Planes(values, saturated, None if joined is None else joined.exposure)
 
 

@@ -3,9 +3,13 @@
 Stripes of a Gray or binary code tell such pixels. At an edge one bit of a Gray code lies between dark and bright; where the stripes of two
 surfaces are mixed, every bit by which their numbers differ does, by the part of the light that comes from either. Several periods
 contradict each other there; a single one, numbered by stripes, does not, and its place is off by what the smaller part turns the phase.
+
+At a step that moves places by less than a period no wave contradicts another: the place lies between those to which the surfaces on both
+sides lead, and may be off by its distance from the nearer one.
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -16,6 +20,7 @@ from service.depth.patterns.levels import contrasts
 from service.depth.patterns.readings import grey_of
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
+from stage.patterns.kary import KaryCode
 from stage.patterns.phase import PhaseCode
 from stage.stack.planes import Planes
 
@@ -26,6 +31,8 @@ CLEAR_SIGMAS = 3.0
 TURN = 0.9
 """Standard deviation of a phase to which a part f of the light, over the rest, adds another phase, times f / (1 - f): between small parts,
 where it is .71, and halves of any two phases, where it is .91."""
+STEP_SIGMAS = 2.0
+"""Standard deviations of the noise by which a place must lie between those to which its neighbours lead, on both sides."""
 BYTES_PER_PIXEL = 400
 """Memory that this takes for each pixel of a band."""
 
@@ -33,7 +40,30 @@ BYTES_PER_PIXEL = 400
 def widen_mixed(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
                 noise: NoiseModel) -> np.ndarray:
     """Add to the deviations of places what a second surface in the pixel may make; return the factor of `Coordinates.widen`."""
-    return coordinates.widen(decoders, lambda axis, decoder: _turned(planes, axis, decoder, collected, noise))
+    def off(axis: AxisMaps, decoder: AxisDecoder) -> np.ndarray | None:
+        turned = _turned(planes, axis, decoder, collected, noise)
+        if all(isinstance(code, BinaryCode | KaryCode) for code in decoder.used):
+            return turned
+        return np.maximum(0 if turned is None else turned, np.maximum(_between(axis, 0), _between(axis, 1)))
+
+    return coordinates.widen(decoders, off)
+
+
+def _between(axis: AxisMaps, along: int) -> np.ndarray:
+    """Return how far the places of pixels lie from the nearer one to which the neighbours before and behind them along an image axis lead,
+    [rows, cols] projector pixels; 0 where they do not lie clearly between."""
+    place, known, off = axis.coordinate, axis.solved, np.zeros_like(axis.coordinate)
+
+    def led(side: int, near: int) -> np.ndarray:
+        first, second = (np.roll(place, side * far, along) for far in (near, near + 1))
+        there = known & np.roll(known, side * near, along) & np.roll(known, side * (near + 1), along)
+        away = place - first - near * (first - second)
+        return np.where(there & (np.abs(away) > STEP_SIGMAS * axis.sigma * np.sqrt(1 + (1 + near)**2 + near**2)), away, 0)
+
+    for before, behind in product((1, 2), (1, 2)):  # the next pixel may see both surfaces too
+        leads = led(1, before), led(-1, behind)
+        off = np.maximum(off, np.where(leads[0] * leads[1] < 0, np.minimum(np.abs(leads[0]), np.abs(leads[1])), 0))
+    return off
 
 
 def _turned(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> np.ndarray | None:
