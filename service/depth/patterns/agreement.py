@@ -42,7 +42,7 @@ sure ones meet by chance: twice and half the focal length of a camera or project
 than a tenth of them off by more than five deviations in 32."""
 ADVICE = {
     Status.MULTIPATH: "light comes by several ways, as in fog or off shiny and translucent surfaces: project a code whose stripes are all "
-                      "fine (micro, modulated, xor)",
+                      "fine (micro, modulated, xor), and wide enough for the camera to resolve",
     Status.UNDECIDED: "noise, or stripes finer than the camera resolves: use more light, or wider stripes",
     Status.OUT_OF_RANGE: "the code and the geometry contradict each other: check the frames' patterns, projector.camera_from_projector and "
                          "whether the projected image is mirrored",
