@@ -31,8 +31,8 @@ CLEAR_SIGMAS = 3.0
 TURN = 0.9
 """Standard deviation of a phase to which a part f of the light, over the rest, adds another phase, times f / (1 - f): between small parts,
 where it is .71, and halves of any two phases, where it is .91."""
-STEP_SIGMAS = 2.0
-"""Standard deviations of the noise by which a place must lie between those to which its neighbours lead, on both sides."""
+STEP_SIGMAS = 4.0
+"""Standard deviations of the noise by which the places to which the neighbours on both sides lead must differ, so that there is a step."""
 BYTES_PER_PIXEL = 400
 """Memory that this takes for each pixel of a band."""
 
@@ -52,17 +52,19 @@ def widen_mixed(planes: Planes, coordinates: Coordinates, decoders: Sequence[Axi
 def _between(axis: AxisMaps, along: int) -> np.ndarray:
     """Return how far the places of pixels lie from the nearer one to which the neighbours before and behind them along an image axis lead,
     [rows, cols] projector pixels; 0 where they do not lie clearly between."""
-    place, known, off = axis.coordinate, axis.solved, np.zeros_like(axis.coordinate)
+    place, off = axis.coordinate, np.zeros_like(axis.coordinate)
+    known = np.pad(axis.solved, 3)  # so that the other border of the image is no neighbour
 
     def led(side: int, near: int) -> np.ndarray:
         first, second = (np.roll(place, side * far, along) for far in (near, near + 1))
         there = known & np.roll(known, side * near, along) & np.roll(known, side * (near + 1), along)
-        away = place - first - near * (first - second)
-        return np.where(there & (np.abs(away) > STEP_SIGMAS * axis.sigma * np.sqrt(1 + (1 + near)**2 + near**2)), away, 0)
+        return np.where(there[3:-3, 3:-3], place - first - near * (first - second), 0)
 
     for before, behind in product((1, 2), (1, 2)):  # the next pixel may see both surfaces too
         leads = led(1, before), led(-1, behind)
-        off = np.maximum(off, np.where(leads[0] * leads[1] < 0, np.minimum(np.abs(leads[0]), np.abs(leads[1])), 0))
+        noise = axis.sigma * np.sqrt(sum((1 + near)**2 + near**2 for near in (before, behind)))
+        step = (leads[0] * leads[1] < 0) & (np.abs(leads[0] - leads[1]) > STEP_SIGMAS * noise)
+        off = np.maximum(off, np.where(step, np.minimum(np.abs(leads[0]), np.abs(leads[1])), 0))
     return off
 
 

@@ -41,7 +41,7 @@ def test_coordinates_are_the_result_of_a_capture_without_calibration(relit, tmp_
         ratio = error / channels[f"sigma.{name}"][mask]
         assert 0.8 < np.sqrt(np.mean(ratio**2)) < 1.2  # as in test_depth.py
     # a place between those of both sides of the silhouette holds them in its sigma
-    assert (channels["confidence.Y"][mask] > 0.5).mean() > 0.99
+    assert (channels["confidence.Y"][mask] > 0.5).mean() > 0.95
     assert "has no focal_px and no camera_from_projector" in report["found"]["decoded_only"] and "decoded only, without depth" in said
     assert report["points"] == 0 and report["pixels"]["ok"] == mask.sum() and report["sigma_u_px"]["median"] > 0
     assert "decoded projector coordinates alone" in relit.refused("export", tmp_path / "out", "--out", tmp_path / "asset.usdz")
