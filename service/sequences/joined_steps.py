@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from service.sequences.agreement import Track, advance, agree, begin, noise_share, steady
 from stage.formats.ply import PointCloud
@@ -182,6 +183,16 @@ def _middle(values: np.ndarray, where: np.ndarray) -> float:
     return float(f"{np.median(values[where]):.4g}") if where.any() else 0.0
 
 
+UNUSUAL, AROUND = 2.0, 9
+"""Most times that the deviation of a depth that is joined may have of the median in a window with this side: a far wider one is that of a
+pixel that may see two surfaces, as at a silhouette, and agrees with either."""
+
+
+def _usual(sigma: np.ndarray) -> np.ndarray:
+    """Return where deviations, [rows, cols], are those of the pixels around, [rows, cols] bool."""
+    return np.asarray(sigma <= UNUSUAL * ndimage.median_filter(sigma, AROUND))
+
+
 @dataclass
 class DepthJoiner:
     """The recursive mean of depths, step by step."""
@@ -202,7 +213,7 @@ class DepthJoiner:
             return _without_coordinates(alone), {"joined_pixels": 0, "steps_joined": {"median": 1.0, "most": 1}}
         before = self._before
         earlier = np.zeros_like(sigma) if before.sigma is None else before.sigma.astype(np.float32)
-        both = valid & before.mask & (earlier > 0)
+        both = valid & before.mask & (earlier > 0) & _usual(sigma) & _usual(earlier)
         difference = values - before.depth[..., None]
         share = noise_share(difference, sigma**2 + earlier**2, both, 1)
         if (self._track.count[both] == 1).all():  # only now is known how much of the first step is noise
