@@ -21,6 +21,7 @@ from service.solve.coherent_materials import agree_on_materials
 from service.solve.height import integrability
 from service.solve.height.height import guessed_part, height_warnings, integrate
 from service.solve.height.parts import Placement, numbered, place_solution
+from service.solve.inside_pixels import unseen_bend
 from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
@@ -149,6 +150,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
             integrate, given, solution.normal, estimated, sigma=sigma, specular=specular))
     if solution.shared_misfit is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)
+    raise_error(solution, unseen_bend(solution.normal.reshape(3, *shape), solution.standard_error().reshape(shape), estimated).reshape(-1))
     if request.materials is Materials.COHERENT:
         agree_on_materials(solution, sigma, shape, given.device)
     refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
