@@ -86,7 +86,7 @@ def solve_robust(readings, directions, *, rounds=5):
         given = np.sort(y[y > 0])[::-1]
         if len(given) == 0:
             return *NOTHING, "DARK", np.zeros_like(y)
-        bright_end = given[max((len(given) - 5) // 10, 0)]
+        bright_end = given[max((len(given) - 5) // 10, 1 if len(given) >= 5 else 0)]
         lit = 10 * y > bright_end * (1 + 1e-12)  # exactly a tenth, as eight bits often are, is shadow: not a matter of rounding
         ranked = np.sort(y[lit])[::-1]
         count = len(ranked)

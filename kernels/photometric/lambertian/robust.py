@@ -24,6 +24,9 @@ from kernels.photometric.lambertian.readings import Readings
 
 BRIGHT_FRACTION = 0.1
 """Fraction of the lights whose readings exceed the bright end of a pixel, so that single highlights lie above it."""
+ONE_HIGHLIGHT = 5
+"""Least number of readings of which one exceeds the bright end in any case: the light of one highlight leaves what determines a normal and
+checks it."""
 SHADOW_FRACTION = 0.1
 """Fraction of the bright end below which a reading is in shadow, attached or cast."""
 DARK_RANKS = 0.2
@@ -103,17 +106,19 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
         light_count = lights.shape[0]
         start = p * pack_stride
 
-        # the bright end: the value that a tenth of the readings exceed, by bisection
+        # the bright end: the value that a tenth of the readings, or one, exceed, by bisection
         top, given = float_pack(), float_pack()
         for light in range(light_count):
             y = readings[start + light * light_stride]
             for k in range(pack):
                 top[k] = wp.max(top[k], y[k])
                 given[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
-        low, high, middle = float_pack(), float_pack(), float_pack()
+        low, high, middle, outshining = float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
             low[k] = RANGE * top[k]
             high[k] = top[k]
+            one = wp.where(given[k] >= float(ONE_HIGHLIGHT), 1.0, 0.0)
+            outshining[k] = wp.max(BRIGHT_FRACTION * given[k] - 0.5, one)
         for step in range(BISECTIONS):
             above = float_pack()
             for k in range(pack):
@@ -123,7 +128,7 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                 for k in range(pack):
                     above[k] += wp.where(y[k] > middle[k], 1.0, 0.0)
             for k in range(pack):
-                halve(middle[k], above[k] > wp.max(BRIGHT_FRACTION * given[k] - 0.5, 0.0), low[k], high[k])
+                halve(middle[k], above[k] > outshining[k], low[k], high[k])
 
         # among the lit lights, the values between which the kept ranks lie
         shadow, lit = float_pack(), float_pack()

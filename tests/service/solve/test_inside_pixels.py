@@ -14,9 +14,9 @@ def _wave(period: float, height: float) -> np.ndarray:
 
 
 def test_the_error_is_that_of_the_mean_over_the_spot():
-    """A Gaussian spot of standard deviation b multiplies a wave of frequency w by exp(-b²w²/2), so that it takes off all but this part; the
-    Laplacian of neighbours is (2 - 2 cos w)/w² of the true one and the series stops at its first term: 4 % for a period of 12 pixels. The other component of
-    the normal bends, too, by 0.0002°."""
+    """A Gaussian spot of standard deviation b multiplies a wave of frequency w by exp(-b²w²/2), so that it takes off all but this part. The
+    differences of neighbours are (2 - 2 cos w)/w² of the true ones, and the series stops at its first term: 4 % for a period of 12 pixels.
+    The other component of the normal bends, too, by 0.0002°."""
     period, height = 12.0, 0.01
     found = unseen_bend(_wave(period, height), np.zeros((ROWS, COLS)), np.ones((ROWS, COLS), bool))
     frequency = 2 * np.pi / period

@@ -53,6 +53,18 @@ def test_a_mirrored_lamp_does_not_matter(brightness, device):
     assert (angle_degrees(solved.normal, normal) <= 1.01 * angle + FLOAT32_DEGREES).all()
 
 
+def test_a_mirrored_lamp_does_not_matter_under_few_lights(device):
+    """One of twelve readings, all of them lit: the others are not in shadow beside it."""
+    normal, direction, irradiance = lattice(300, 30), lattice(12, 40), np.ones((12, 3))
+    radiance = 0.05 * shade(normal, np.full((300, 3), 0.5), direction, irradiance)
+    lamp = np.random.default_rng(1).integers(0, 12, 300)
+    radiance[:, lamp, np.arange(300)] = 10.0
+    solved = solve(solve_robust, radiance, direction, irradiance, device)
+    assert (solved.status == Status.OK).all()
+    angle, _ = rounding_bounds(normal, np.full((300, 3), 0.025), direction, irradiance, solved.weights > 0)
+    assert (angle_degrees(solved.normal, normal) <= 1.01 * angle + FLOAT32_DEGREES).all()
+
+
 def noisy(pixels, lights, noise, seed, *, quantised=False, spoiled=True):
     """Readings with every kind of error at once, the same in all channels."""
     rng = np.random.default_rng(seed)
