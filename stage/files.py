@@ -1,18 +1,29 @@
-"""Writing of files and folders whole or not at all: a temporary one beside the target, files flushed to disk, then renamed."""
+"""Writing of files and folders whole or not at all: a temporary one beside the target, files flushed to disk, then renamed.
 
+A temporary file or folder is locked while its process lives. The next process that writes into the same folder removes those without a
+lock, which killed processes left; those of another machine, whose locks some file systems do not show, after a day.
+"""
+
+import fcntl
 import os
+import platform
 import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stage.errors import StorageError, storage
 
 _umask_lock = threading.Lock()
-_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., eight characters of mkstemp, SUFFIX
+_MARK = f"relit-{zlib.crc32(platform.node().encode()):08x}-"
+_TEMPORARY = re.compile(r"\..+\.relit-[0-9a-f]{8}-[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., the mark, eight characters of mkstemp, SUFFIX
+_DAY_S = 86400
+_swept: set[Path] = set()
 
 
 @contextmanager
@@ -26,26 +37,31 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
         Missing parent folders are made.
     """
     target = Path(path)
-    with storage("write", target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+
+    def make() -> str:
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.{_MARK}", suffix=target.suffix, dir=target.parent)
         os.close(handle)
-    temporary = Path(name)
-    try:
-        with storage("write", target):
-            yield temporary
-            os.chmod(temporary, 0o666 & ~_umask())
-            if flush:
-                with open(temporary, "rb") as written:
-                    os.fsync(written.fileno())
-            os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+        return name
+
+    with _locked(target, make) as temporary:
+        try:
+            with storage("write", target):
+                yield temporary
+                os.chmod(temporary, 0o666 & ~_umask())
+                if flush:
+                    with open(temporary, "rb") as written:
+                        os.fsync(written.fileno())
+                os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
-def require_writable(path: Path) -> None:
-    """Raise StorageError unless a file or folder can be made at a path, whose missing parents are made with it."""
-    existing = path.parent
+def require_writable(path: Path, *, folder: bool = False) -> None:
+    """Raise StorageError unless a file, or with `folder` the files of a folder, can be made at a path, whose missing parents are made with
+    it."""
+    if not folder and path.is_dir():
+        raise StorageError(f"cannot write {path}: is a directory")
+    existing = path if folder else path.parent
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
@@ -55,11 +71,13 @@ def require_writable(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files of `replacing` that killed processes left in a folder; nobody may be writing there."""
+    """Remove the temporary files and folders that killed processes left in a folder."""
     with storage("write", folder):
         for path in folder.glob(".*"):
-            if _TEMPORARY.fullmatch(path.name):
-                path.unlink(missing_ok=True)
+            if _TEMPORARY.fullmatch(path.name) and (lock := _lock(path)) is not None:
+                if _MARK in path.name or os.fstat(lock).st_mtime < time.time() - _DAY_S:
+                    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+                os.close(lock)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -72,14 +90,12 @@ def write_text(path: str | Path, text: str) -> None:
 def folder_beside(path: str | Path) -> Iterator[Path]:
     """Yield a temporary folder beside `path`, which none but its owner reads and which is removed at the end."""
     target = Path(path).absolute()
-    with storage("write", path):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
-    try:
-        with storage("write", path):
-            yield temporary
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with _locked(target, lambda: tempfile.mkdtemp(prefix=f".{target.stem}.{_MARK}", dir=target.parent)) as temporary:
+        try:
+            with storage("write", path):
+                yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
@@ -105,6 +121,37 @@ def resolved(path: Path) -> Path | None:
         return path.resolve()
     except (OSError, RuntimeError, ValueError):
         return None
+
+
+@contextmanager
+def _locked(target: Path, make: Callable[[], str]) -> Iterator[Path]:
+    """Yield the temporary file or folder that is made beside a target, locked; what killed processes left there is removed first."""
+    with storage("write", target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.parent not in _swept:
+            _swept.add(target.parent)
+            remove_unfinished(target.parent)
+        while (lock := _lock(temporary := Path(make()), wait=True)) is None and not temporary.exists():
+            pass  # another process took it for one that was left, before it had its lock
+    try:
+        yield temporary
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _lock(path: Path, *, wait: bool = False) -> int | None:
+    """Lock a file or folder and return its descriptor; None: it is locked or gone, or the file system has no locks."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if os.path.samestat(os.fstat(descriptor), path.stat(follow_symlinks=False)):
+                return descriptor
+        except OSError:
+            pass
+        os.close(descriptor)
+    return None
 
 
 def _umask() -> int:

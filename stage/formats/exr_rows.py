@@ -8,8 +8,7 @@ Source: "OpenEXR File Layout" of the OpenEXR documentation.
 
 import os
 import struct
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stage.errors import storage
-from stage.files import replacing
+from stage.files import folder_beside, replacing
 from stage.formats import exr, exr_scan
 from stage.formats.exr_scan import SCANLINES_PER_CHUNK, SEVERAL_PARTS
 
 BLOCK_ROWS = 32
 """Every block but the last has a multiple of so many rows: the chunks of all compressions that Relit writes with divide it."""
+BLOCK_PIXELS = 1 << 20
+"""Pixels that `write` hands over at a time: a second of work for the channels of maps."""
 
 
 class _Attribute(NamedTuple):
@@ -51,8 +52,8 @@ class RowFile:
         rows = len(next(iter(parts[0].channels.values())))
         if self._taken + rows > self._rows or (rows % BLOCK_ROWS and self._taken + rows < self._rows):
             raise ValueError(f"{rows} rows after {self._taken} of {self._rows}: give multiples of {BLOCK_ROWS} until the last")
-        with storage("write", self._path), tempfile.TemporaryDirectory(prefix=f".{self._path.stem}.", dir=self._path.parent) as folder:
-            block = Path(folder) / "rows.exr"
+        with folder_beside(self._path) as folder:
+            block = folder / "rows.exr"
             exr.encode(block, parts, metadata=self._metadata, path=self._path)
             content = block.read_bytes()
         several = bool(content[5] & SEVERAL_PARTS)
@@ -99,6 +100,18 @@ def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: boo
         file = RowFile(temporary, path=path, rows=rows, metadata=metadata)
         yield file
         file.close(checksum=checksum)
+
+
+def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: str, metadata: Mapping[str, Any],
+          progress: Callable[[int], None]) -> None:
+    """Write what exr.write does, some rows at a time; `progress`: told how many are written."""
+    rows, cols = next(iter(channels.values())).shape
+    step = max(1, BLOCK_PIXELS // (BLOCK_ROWS * cols)) * BLOCK_ROWS
+    with growing(Path(path), rows=rows, metadata=metadata) as file:
+        for first in range(0, rows, step):
+            block = {name: plane[first : first + step] for name, plane in channels.items()}
+            file.append([exr.Part("", block, color_space, exr.Compression.ZIP)])
+            progress(min(first + step, rows))
 
 
 def _attributes(header: bytes, *, several: bool) -> Iterator[_Attribute]:

@@ -11,7 +11,7 @@ import pytest
 
 import stage
 from stage.errors import StorageError
-from stage.files import remove_unfinished, replacing, replacing_folder, write_text
+from stage.files import folder_beside, remove_unfinished, replacing, replacing_folder, write_text
 from tests.scenes.captures import files_in
 
 ROOT = Path(stage.__file__).parents[1]
@@ -33,10 +33,14 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".0001_light.")
-    kept = {"0001_light.exr", ".gitignore", ".hidden.exr", "a.b12345678.exr"}
+    kept = {"0001_light.exr", ".gitignore", ".hidden.exr", ".user.settings.json", "a.b12345678.exr"}
     for name in kept:
         (tmp_path / name).touch()
-    remove_unfinished(tmp_path)
+    with folder_beside(tmp_path / "other") as folder:
+        assert not left.exists()  # and what is in use stays, also for another process
+        subprocess.run([sys.executable, "-c", f"import stage.files\nstage.files.write_text({str(target)!r}, 'x')"], cwd=ROOT,
+                       env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True)
+        assert folder.is_dir()
     remove_unfinished(tmp_path / "none")
     assert {path.name for path in tmp_path.iterdir()} == kept
 

@@ -5,7 +5,6 @@ Source: glTF 2.0 Specification, 3.6 "Binary Data Storage" and 4 "GLB File Format
 
 import shutil
 import struct
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from pygltflib import GLTF2, Accessor, Buffer, BufferView, Image
 
 from service.errors import AssetError
-from stage.files import replacing
+from stage.files import folder_beside, replacing
 
 MAX_FILE_BYTES = 2**32 - 1
 """The header of the file gives its length in 32 bits (4.4.2)."""
@@ -93,9 +92,9 @@ class Glb:
 @contextmanager
 def writing_glb(target: Path) -> Iterator[tuple[Glb, Path]]:
     """Yield an empty document and a folder for its images; the file replaces `target`, whole or not at all, when the block ends."""
-    with replacing(target) as temporary, tempfile.TemporaryDirectory(prefix=f".{target.stem}.", dir=target.parent) as folder:
+    with replacing(target) as temporary, folder_beside(target) as folder:
         glb = Glb()
-        yield glb, Path(folder)
+        yield glb, folder
         glb.write(temporary)
 
 
