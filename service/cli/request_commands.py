@@ -41,7 +41,7 @@ from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, require_outputs, typed, typed_name
 
-ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
+ORDER = (Role.INPUT, Role.OUTPUT, Role.FILE, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
 READ_BY_TYPER = (bool, int, float, Path, Enum)
 """The types that Typer reads; anything else is a text that the model parses."""

@@ -33,7 +33,7 @@ LIGHTS = "relit:declared_lights"
 
 _names: ContextVar[dict[str, str] | None] = ContextVar("names of places", default=None)
 
-UNREPORTED = (Role.OUTPUT, Role.MACHINE, Role.PART)
+UNREPORTED = (Role.OUTPUT, Role.FILE, Role.MACHINE, Role.PART)
 """Roles of fields that a report does not repeat."""
 
 

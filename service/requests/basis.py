@@ -37,7 +37,7 @@ class BasisRequest(BasisCount, Request):
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The file: .exr, .ptm or .rti; a .json that describes it is written beside it."""
     kind: BasisKind | None = None
     """The kind of basis to which the capture is reduced; None: the first kind with the suffix of `out`."""

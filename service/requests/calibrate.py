@@ -93,7 +93,7 @@ class LightsRequest(LightsOptions):
     """Folder of the capture with the calibration images; its distant and point lights may be placeholders."""
     apply_to: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
-    out: Annotated[Path | None, Role.OUTPUT] = None
+    out: Annotated[Path | None, Role.FILE] = None
     """Manifest to write; None: the target's own capture.json."""
 
 
@@ -123,7 +123,7 @@ class IntensityRequest(IntensityOptions, LightsRequest):
 class ManifestRequest(Options):
     """Base of the kinds that change one value of a capture's manifest."""
 
-    out: Annotated[Path | None, Role.OUTPUT] = None
+    out: Annotated[Path | None, Role.FILE] = None
     """Manifest to write, with the files that the calibration makes beside it; None: the capture's own capture.json."""
 
 
@@ -286,5 +286,5 @@ class TofCalibrationRequest(DeviceRequest):
 
     sweep: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SWEEP")]
     """A relit.tof-sweep/1 file: captures and their distances."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The relit.tof/1 file to write."""

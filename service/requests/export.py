@@ -72,7 +72,7 @@ class ExportRequest(ExportOptions):
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
     """Folder with maps.exr or depth.exr, or the file; or the results of a sequence, which become a .usdc or .usdz with time samples."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The asset: .usdz, .usda, .usdc or .glb (binary glTF)."""
     rig: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture that was solved: its lights come along as UsdLux lights whose intensities replay it, as a variant that is off. For .usdz,
@@ -88,7 +88,7 @@ class ExportRequest(ExportOptions):
 class BlenderExtensionRequest(Options):
     """Write the extension that brings Relit into Blender 4.2 and later; Blender's preferences install it from the file."""
 
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The extension: .zip."""
 
 

@@ -88,10 +88,10 @@ class TwinRequest(ReviewOptions, DrivenOptions, PixelOptions, Request):
     """The port of the page on this machine; 0: any free one."""
     exposure: Finite = 0.0
     """Stops by which pictures on the page and PNG files are brighter."""
-    snapshot: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE")] = None
+    snapshot: Annotated[Path | None, Role.FILE, Spelling(metavar="FILE")] = None
     """Write the picture of the last frame that is received, .exr or .png; without `frames` and `after`, of the first one. There is no page
     then."""
-    record: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE.csv")] = None
+    record: Annotated[Path | None, Role.FILE, Spelling(metavar="FILE.csv")] = None
     """Write the levels of all frames that are received, a line for each."""
     pictures: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FOLDER")] = None
     """Be a camera too: write a picture into this folder at each POST to /release of the page, which may have ?exposure_s=; with the format

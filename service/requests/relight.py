@@ -42,7 +42,7 @@ class RelightRequest(ReviewOptions, RelightOptions, Request):
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json; or a sequence: a folder with such folders, one for each time step, which give one frame each in the order
     of their names."""
-    out: Annotated[str, Role.OUTPUT]
+    out: Annotated[str, Role.FILE]
     """Path of the frames, with #### for the number."""
     environment: Annotated[Path | None, Role.INPUT] = None
     """Lat-long environment map, .exr or .hdr; with #### in its name, a map for each frame."""

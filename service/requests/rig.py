@@ -39,7 +39,7 @@ class RigCheckRequest(Options):
 
     rig: Annotated[Path, Role.INPUT, RIG]
     """The rig (JSON, schema relit.rig/1); docs/drive.md."""
-    picture: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE.png")] = None
+    picture: Annotated[Path | None, Role.FILE, Spelling(metavar="FILE.png")] = None
     """Write a picture of the dome."""
 
 
@@ -48,7 +48,7 @@ class RigFromCaptureRequest(PatchOptions):
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json, a frame for each lamp."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The rig file."""
     primaries: Primaries = Primaries.RGB
     """The primaries of every lamp."""
@@ -59,7 +59,7 @@ class RigFromCsvRequest(PatchOptions):
 
     table: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="TABLE.csv")]
     """The table; x, y and z in the camera frame: x to the right, y up, z towards the viewer."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The rig file."""
     places: bool = False
     """x, y and z are places in metres, and not directions."""
@@ -74,7 +74,7 @@ class RigFromMvrRequest(Options):
 
     scene: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCENE.mvr")]
     """The scene, with the GDTF files of its fixtures; needs pymvr and pygdtf: pip install 'relit[set]'."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The rig file."""
     subject: Annotated[tuple[Finite, Finite, Finite], Commas, Spelling(metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
     """The place of the subject in the scene, in metres: z up, as in the scene."""
@@ -153,7 +153,7 @@ class RigCalibrationRequest(RigCalibrationOptions):
     table: Annotated[Path, Role.INPUT, Spelling(metavar="TABLE.csv")]
     """What each frame shows: CSV with the columns frame, light, primary, level, as the cues.csv of `relit rig sweep`; a frame is an
     image, or its number in the capture from 1."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The rig file to write, with calibration.json beside it, and chart.json where a chart is the target."""
     masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
     """Mask image of the ball, in place of `ball`; more precise."""

@@ -132,7 +132,7 @@ class ShadeRequest(ReviewOptions, ShadeOptions, Request):
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
     """Folder with maps.exr, or the file."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Annotated[Path, Role.FILE]
     """The picture: .exr."""
     environment: Annotated[Path | None, Role.INPUT] = None
     """Lat-long environment map, .exr or .hdr."""

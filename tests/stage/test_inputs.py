@@ -269,7 +269,7 @@ def test_every_text_of_a_manifest_or_a_request_is_checked():
     known = models()
     assert len(known) > 60
     unchecked = {f"{model.__name__}.{name}" for model in known for name, field in model.model_fields.items()
-                 if Role.OUTPUT not in field.metadata and bare_text(field.annotation, tuple(field.metadata))}
+                 if Role.FILE not in field.metadata and bare_text(field.annotation, tuple(field.metadata))}
     commands = {"HttpRequest.url", "HttpRequest.body", "SerialController.on", "SerialController.off"}  # with line ends, of a rig's owner
     assert unchecked == commands
 

@@ -132,8 +132,8 @@ def nested(field: FieldInfo) -> type[Options] | None:
 def require_outputs(request: BaseModel) -> None:
     """Raise StorageError where results cannot be written: before the work, which may take hours, and not after it."""
     for option, value in values_of(request):
-        if option.role is Role.OUTPUT and isinstance(value, Path):
-            require_writable(value)
+        if option.role in (Role.OUTPUT, Role.FILE) and isinstance(value, Path):
+            require_writable(value, folder=option.role is Role.OUTPUT)
 
 
 def is_document(kind: Any) -> bool:

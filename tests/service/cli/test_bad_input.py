@@ -246,6 +246,19 @@ def test_results_below_a_file_are_refused_before_any_work(relit, tmp_path, monke
     assert files_in(tmp_path) == before | {"file"}
 
 
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("solve", "none", "--out", "file"), "cannot write file: not a directory"),
+    (("depth", "none", "--out", "file"), "cannot write file: not a directory"),
+    (("basis", "none", "--out", "folder"), "cannot write folder: is a directory"),
+    (("calibrate", "tof", "none", "--out", "folder"), "cannot write folder: is a directory")])
+def test_files_for_folders_and_folders_for_files_are_refused_before_any_work(relit, tmp_path, monkeypatch, arguments, words):
+    """The input, which is not there, would be refused first by the work."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    relit(*arguments).refused(words)
+
+
 @pytest.mark.parametrize(("stage", "limit", "words"), [
     ("stack", 2500, "cannot make the stack cache"),
     ("maps", 2000, "cannot write"),
