@@ -95,11 +95,12 @@ def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: 
             coefficients[k, :, :width] = layer[:, each.span]  # rounded as it is stored: what is left is what the file leaves
         squares = to_numpy(squared_residual(each.band, gains, coefficients, functions))
         left += squares[:, each.inside].sum(axis=1, dtype=np.float64)
-    timings.stage("write", 1)
+    timings.stage("write", source.capture.camera.height)
     rows, cols = source.capture.camera.height, source.capture.camera.width
     whole = np.trace(products, axis1=1, axis2=2)
     write_layers(request.out, [layer.reshape(3, rows, cols) for layer in layers],
-                 source.inside[: stack.pixel_count].reshape(rows, cols), color_space=source.space, metadata=source.provenance)
+                 source.inside[: stack.pixel_count].reshape(rows, cols), color_space=source.space, metadata=source.provenance,
+                 progress=timings.advance)
     tail = (basis.singular_values[:, count:] ** 2).sum()
     relative = _relative(left.sum(), whole.sum())
     key_lights = _key_light_error(source, basis, products)

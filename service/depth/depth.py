@@ -126,9 +126,9 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
             solution.warnings.append(f"camera.pixel_size_m is missing: x and y of {POINTS_FILE} are in pixels, and its z in metres")
         timings.stage("points", 1)
         cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
-    timings.stage("write", 1)
+    timings.stage("write", len(mask))
     maps = solution.maps(capture.camera, sources)
-    maps.write(depth_path)
+    maps.write(depth_path, timings.advance)
     if cloud is None:
         with storage("remove", points_path):
             points_path.unlink(missing_ok=True)  # of an earlier run: there are no points beside this file

@@ -29,7 +29,7 @@ from stage.colour.colour_spaces import linear_space
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ManifestError
 from stage.files import write_text
-from stage.formats import exr
+from stage.formats import exr_rows
 from stage.patterns.base import Axis
 from stage.patterns.codes import Collected, collect
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -116,6 +116,7 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     counts = {name: int((light.status[mask] == code).sum()) for name, code in (("ok", OK), ("saturated", Status.SATURATED))}
     if not solved.any():
         raise ManifestError(f"{capture.folder}: no pixel is separated ({counts['saturated']} saturated): expose the phase frames for less")
+    timings.stage("judge", 1)
     total = (light.direct + light.indirect).sum(axis=-1)
     ratios = _sum_over_white(Correction.of(capture).apply if joined is None else joined.read, frames, collected, total, solved)
     ratio = None if ratios is None else float(np.nanmedian(ratios))
@@ -123,14 +124,14 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
         raise ManifestError(f"{capture.folder}: direct and global light add up to {ratio:.2f} of the white frame: the patterns must be "
                             "linear in light (relit patterns --gamma, color_space), and ambient light needs a black or an off frame")
     warnings = [*clipping_sentences(capture.clipped), *check.faults(ratios)]
-    timings.stage("write", 1)
+    timings.stage("write", len(mask))
     content = content_of(capture)
     path, report_path = request.out / SEPARATION_FILE, request.out / REPORT_FILE
     channels = {f"{name}.{channel}": values[..., c] for name, values in (("direct", light.direct), ("global", light.indirect))
                 for c, channel in enumerate("RGB")}
-    exr.write(path, {**channels, "mask.Y": solved.astype(np.float16), "status.Y": light.status.astype(np.float16)},
-              color_space=linear_space(capture.manifest.color_space),
-              metadata=result_metadata(capture.camera, metadata(request, capture=capture.name, inputs=content, method=METHOD)))
+    exr_rows.write(path, {**channels, "mask.Y": solved.astype(np.float16), "status.Y": light.status.astype(np.float16)},
+                   color_space=linear_space(capture.manifest.color_space), progress=timings.advance,
+                   metadata=result_metadata(capture.camera, metadata(request, capture=capture.name, inputs=content, method=METHOD)))
     lit = _lit(total, solved)
     share = statistics(light.indirect.sum(axis=-1)[lit] / total[lit])
     write_text(report_path, report(

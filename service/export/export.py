@@ -105,13 +105,13 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
     around = _open_surroundings(request, maps, path)
     contents = {path.stem: digest(path), **_content_hashes(around)}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
-    timings.stage("asset", 1)
+    timings.stage("repair", 1)
     with _named(path):
         maps, _, repairs = repair_heights(maps)
     more = {"levels": request.levels, "surroundings": around} if writer.variants else {}
     with _named(path):
         report = writer.surface(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version,
-                                textures=request.textures, **more)
+                                textures=request.textures, progress=timings, **more)
     warnings = [*repairs, *clipping_sentences({**(around.clipped or {}), **(around.rig.clipped if around.rig is not None else {})}),
                 *outside_sentences(around.outside or {}, "light", "Rec.709", "assets have lights in no wider space"),
                 *(around.encodings or {}).values(), *report.warnings]
@@ -159,10 +159,10 @@ def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple
     cloud: PointCloud | None = read_ply(beside) if beside.exists() else None
     contents = {file.stem: digest(file) for file in (path, beside) if file.exists()}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
-    timings.stage("asset", 1)
+    timings.stage("mesh", 1)
     with _named(path):
         warnings = write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
-                         geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
+                         geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures, progress=timings)
     return Exported(request.out, warnings, {})
 
 

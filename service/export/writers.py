@@ -27,9 +27,10 @@ class Writer(NamedTuple):
     """The functions that write files of a format, whole or not at all, and read them back; one that is left out refuses."""
 
     surface: Callable[..., AssetReport] = _refuse
-    """(SurfaceMaps, path, *, name, version, textures): solved maps with their material and camera."""
+    """(SurfaceMaps, path, *, name, version, textures, progress): solved maps with their material and camera."""
     depth: Callable[..., tuple[str, ...]] = _refuse
-    """(DepthMaps, PointCloud | None, path, *, name, geometry, version, textures): a depth; returns sentences on what the asset lacks."""
+    """(DepthMaps, PointCloud | None, path, *, name, geometry, version, textures, progress): a depth; returns sentences on what the
+    asset lacks."""
     fused: Callable[..., None] = _refuse
     """(UnwrappedMesh, BakedImages, path, *, name, provenance): a fused surface with textures."""
     mesh: Callable[..., None] = _refuse

@@ -82,8 +82,8 @@ class Guide:
         self._keep = len(self._place) * len(self._model.pixels) <= devices.batch_bytes(device, KEPT_BYTES)
         self._seen: dict[int, wp.array] = {}
         if progress is not None:
-            progress.stage("guide", len(self._model.pixels))
-        moments = self._sums(MOMENTS, profile_moments, None)
+            progress.stage("guide", 2 * len(self._model.pixels))
+        moments = self._sums(MOMENTS, profile_moments, progress)
         self._model.profile = fit_profile(moments, self._model.pixels, maps.mask.shape)
         self.trust = self._fit(partial(compare_model, neighbours=neighbours, shares=shares), progress)
         """[n] β of the model's pixels between the captured lights, 0…1."""
@@ -102,17 +102,17 @@ class Guide:
 
     def _fit(self, compare: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
         """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
-        return fit_trust(self._sums(2, compare, progress), self._model.pixels, self._model.maps.mask.shape)
+        return fit_trust(self._sums(2, compare, progress, before=len(self._model.pixels)), self._model.pixels, self._model.maps.mask.shape)
 
-    def _sums(self, rows: int, take: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
-        """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch."""
+    def _sums(self, rows: int, take: Callable[[Captured], wp.array], progress: Timings | None, before: int = 0) -> np.ndarray:
+        """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch; `before`: steps of the progress until then."""
         sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
             taken = take(self._captured(batch, self._recorded, self._visible(batch)))
             sums[:, done : done + len(batch.pixels)] = to_numpy(taken)[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
-                progress.advance(done)
+                progress.advance(before + done)
         return sums
 
     def _captured(self, batch: ModelBatch, images: ImagesOnDevice[Stack], visible: wp.array, band: Band | None = None) -> Captured:

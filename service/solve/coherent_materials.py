@@ -10,6 +10,7 @@ import numpy as np
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC
 from kernels.photometric.material.total_variation import STEPS, between, least_variation
 from kernels.status import ESTIMATED
+from service.reporting.progress import Progress, Timings
 from service.solve.base.solution import Solution
 
 STRENGTH = 0.5
@@ -30,7 +31,8 @@ UNSURE_WIDTH = 0.25
 under a light beside it the pixel would flare up. Metals, whose standard errors are several times too large, keep theirs."""
 
 
-def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int], device: str) -> None:
+def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int], device: str,
+                       progress: Progress | None = None) -> None:
     """Replace roughness and F0 of a solution by those that neighbouring pixels agree on, and widen lobes of dielectrics that are narrower
     than their normals are sure; pixels with two materials keep theirs.
     `sigma`: [pixels] standard error of the normals as each pixel's own readings show it, degrees. `shape`: rows and columns of the
@@ -65,7 +67,11 @@ def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, 
         together = known[one] & known[other] & (parts[one] == parts[other])
         links.append((STRENGTH / np.hypot(*step) * together * np.exp(-0.5 * unlike)).astype(np.float32))
     neutral = (specular == specular[:1]).all()  # no coloured metal: one plane stands for three
-    found = least_variation(np.concatenate([image(solution.roughness), specular[:1] if neutral else specular]), trust, links, device=device)
+    timings = Timings(progress)
+    timings.stage("materials", 100)
+    found = least_variation(np.concatenate([image(solution.roughness), specular[:1] if neutral else specular]), trust, links, device=device,
+                            progress=timings.advance_percent)
+    timings.advance(100)
     lobe = (found[0] > 0) & (found[1:].max(axis=0) <= BRIGHTEST_DIELECTRIC)
     found[0] = np.where(lobe, np.maximum(found[0], np.sqrt(UNSURE_WIDTH * np.radians(image(sigma)[0]))), found[0])
     for target, planes in ((solution.roughness, found[:1]), (solution.specular, found[1:])):

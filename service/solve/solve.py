@@ -152,7 +152,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         _judge_by_surface(solution, estimated, opened.capture.camera)
     raise_error(solution, unseen_bend(solution.normal.reshape(3, *shape), solution.standard_error().reshape(shape), estimated).reshape(-1))
     if request.materials is Materials.COHERENT:
-        agree_on_materials(solution, sigma, shape, given.device)
+        agree_on_materials(solution, sigma, shape, given.device, given.timings)
     refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)
     return _Judged(solution, placement, estimated, guessed_part(sigma, estimated))
@@ -179,9 +179,9 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
     sources |= {HASHING: str(LAYOUT), LIGHTS: hash_of_lights(capture.manifest)}
     sources |= {ALBEDO_SCALE: f"{albedo_scale:g}"} if albedo_scale != 1 else {}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)
-    timings.stage("write", 1)
+    timings.stage("write", len(mask))
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
-    maps.write(maps_path)
+    maps.write(maps_path, timings.advance)
     write_text(report_path, report(
         request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(capture.sources()),
@@ -286,7 +286,7 @@ def _count_above_one(solution: Solution, solved: np.ndarray) -> int:
     """Return the number of solved pixels whose albedo is above 1 by more than SURELY_ABOVE of its standard errors."""
     if solution.albedo is None:
         return 0
-    pixels = np.flatnonzero(solved)
+    pixels = np.flatnonzero(solved.reshape(-1) & (solution.albedo > 1).any(axis=0))
     least, sigma = solution.albedo[:, pixels], solution.albedo_sigma(pixels)
     if sigma is not None:
         least = least - np.float32(SURELY_ABOVE) * sigma

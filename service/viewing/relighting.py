@@ -18,7 +18,7 @@ from kernels.relight.model.beyond import reach, share_beyond
 from service.relight.weights.quadrature import quadrature_of
 from service.relight.weights.triangulation import share_smooth
 from service.reporting.progress import Timings
-from service.viewing.block_file import BlockFile
+from service.viewing.block_file import BlockFile, Place
 from service.viewing.card import RelitCard
 from service.viewing.light_transfer import COLS, FULL, ROWS, HeldOutLights, grid_directions, transfer_of
 from service.viewing.reduction import Tiling, plane_means, put_together, step_within, tile_rows, tiling_of
@@ -75,10 +75,14 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     relative_rms = _error(stack, matte, tiling, step, basis, held_out, card, timings)
     coverage = plane_means(matte.coverage, step)
     card.write(folder, coverage, space)
-    timings.stage("blocks", 1)
+    timings.stage("blocks", len(basis.images))
+    blocks: list[Place] = []
+    for place in file.append_all(iter(basis.images)):
+        blocks.append(place)
+        timings.advance(len(blocks))
     return {
         "terms": len(basis.images), "rows": coverage.shape[0], "cols": coverage.shape[1], "step": step, "scale": numbers(basis.scale),
-        "basis": list(file.append_all(iter(basis.images))),
+        "basis": blocks,
         "tiles": {"side": tiling.side, "rows": tiling.index.shape[0], "cols": tiling.index.shape[1], "count": tiling.tile_count,
                   "index": file.append(tiling.index)},
         "captured": file.append(basis.matrix),

@@ -1,5 +1,6 @@
 """The depth of one capture with what was measured beside it, or its decoded projector coordinates alone, and the file, depth.exr."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 
 from stage.capture.camera import Camera
 from stage.errors import ResultError
-from stage.formats import exr
+from stage.formats import exr, exr_rows
 from stage.results.result_metadata import camera_and_provenance, result_metadata
 
 DEPTH_FILE = "depth.exr"
@@ -55,15 +56,16 @@ class DepthMaps:
         """Return the layers that were estimated by their names, in the order of the file."""
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
-    def write(self, path: str | Path) -> None:
-        """Write depth.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status` and COORDINATES."""
+    def write(self, path: str | Path, progress: Callable[[int], None] = lambda rows: None) -> None:
+        """Write depth.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status` and COORDINATES.
+        `progress`: told how many rows are written."""
         estimated = self.mask if self.estimated is None else self.mask | self.estimated
         channels = {}
         for name, values in self.layers().items():
             channel, dtype = LAYERS[name]
             kept = values if name in ("status", *COORDINATES) else np.where(estimated, values, 0)
             channels[channel] = kept.astype(dtype)
-        exr.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance))
+        exr_rows.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance), progress=progress)
 
     @classmethod
     def read(cls, path: str | Path, *, unsure: bool = False) -> "DepthMaps":
@@ -102,8 +104,8 @@ class CoordinateMaps:
     status: np.ndarray  # [rows, cols] uint8, codes of the report
     provenance: dict[str, str] = field(default_factory=dict)
 
-    def write(self, path: str | Path) -> None:
-        """Write depth.exr without layers of depth, whole or not at all."""
+    def write(self, path: str | Path, progress: Callable[[int], None] = lambda rows: None) -> None:
+        """Write depth.exr without layers of depth, whole or not at all; `progress`: told how many rows are written."""
         values = {name: getattr(self, name, None) for name in LAYERS}
         channels = {LAYERS[name][0]: layer.astype(LAYERS[name][1]) for name, layer in values.items() if layer is not None}
-        exr.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance))
+        exr_rows.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance), progress=progress)

@@ -7,14 +7,14 @@ integral of the radiance over its part of the sphere, divided by its irradiance.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stage.files import write_text
-from stage.formats import exr
+from stage.formats import exr, exr_rows
 
 SCHEMA = "relit.basis/1"
 HALF_RMS_MIN = 2.0**-11
@@ -35,12 +35,12 @@ def layer_types(rms: np.ndarray, largest: float) -> list[type[np.floating[Any]]]
 
 
 def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarray, *, color_space: str,
-                 metadata: Mapping[str, str]) -> None:
+                 metadata: Mapping[str, str], progress: Callable[[int], None]) -> None:
     """Write the basis images as layers `basis.NNN.{R,G,B}`, which are 0 outside the mask, and the mask as `mask.Y`.
-    `layers`: K images, each [3, rows, cols] float16 or float32. `mask`: [rows, cols] bool."""
+    `layers`: K images, each [3, rows, cols] float16 or float32. `mask`: [rows, cols] bool. `progress`: told how many rows are written."""
     channels = {f"{layer_name(k)}.{name}": np.where(mask, plane, 0).astype(plane.dtype)
                 for k, layer in enumerate(layers) for name, plane in zip("RGB", layer, strict=True)}
-    exr.write(path, {**channels, "mask.Y": mask.astype(np.float16)}, color_space=color_space, metadata=metadata)
+    exr_rows.write(path, {**channels, "mask.Y": mask.astype(np.float16)}, color_space=color_space, metadata=metadata, progress=progress)
 
 
 def facts_path(path: str | Path) -> Path:

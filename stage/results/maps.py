@@ -11,7 +11,7 @@ from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.point_lights import distance_is_missing
 from stage.errors import ResultError
-from stage.formats import exr
+from stage.formats import exr, exr_rows
 from stage.results.normal_axes import normal_fault
 from stage.results.result_metadata import camera_and_provenance, result_metadata
 
@@ -88,8 +88,9 @@ class SurfaceMaps:
                 changed[specular], changed[roughness] = change(*lobe)
         return replace(self, **changed)
 
-    def write(self, path: str | Path) -> None:
-        """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`."""
+    def write(self, path: str | Path, progress: Callable[[int], None] = lambda rows: None) -> None:
+        """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`; `progress`: told how many
+        rows are written."""
         kept = self.mask if self.estimated is None else self.mask | self.estimated
         channels: dict[str, np.ndarray] = {}
         for name, values in self.layers().items():
@@ -97,7 +98,8 @@ class SurfaceMaps:
             for plane, suffix in zip([values] if values.ndim == 2 else np.moveaxis(values, -1, 0), suffixes, strict=True):
                 stored = channels[f"{name}.{suffix}"] = np.zeros(plane.shape, dtype)
                 np.copyto(stored, plane, where=True if name == "status" else kept, casting="same_kind")
-        exr.write(path, channels, color_space=self.color_space, metadata=result_metadata(self.camera, self.provenance))
+        metadata = result_metadata(self.camera, self.provenance)
+        exr_rows.write(path, channels, color_space=self.color_space, metadata=metadata, progress=progress)
 
     @classmethod
     def read(cls, path: str | Path, *, unsure: bool = False, layers: Collection[str] = tuple(LAYERS)) -> "SurfaceMaps":

@@ -7,7 +7,7 @@ Source: OpenUSD, "UsdPreviewSurface Specification", texture reader (sourceColorS
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from service.asset.content.mesh import SurfaceMesh
 from service.asset.content.metallic import MetallicLook
 from service.asset.content.tangent import TangentFrames
 from service.errors import AssetError
+from service.reporting.progress import Progress, Timings
 from service.requests.export import TextureFormat
 from stage.colour.colour import convert
 from stage.colour.colour_spaces import linear_space
@@ -83,7 +84,8 @@ class BakedImages(NamedTuple):
 
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None = None,
-                   storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None) -> dict[str, Texture]:
+                   storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None,
+                   progress: Progress | None = None) -> dict[str, Texture]:
     """Write the images that the materials of solved maps use, and return them by name, in the order of NAMES.
 
     Args:
@@ -118,14 +120,19 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=colour)
         return Texture(f"{name}.png", space, clipped)
 
-    return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None})
+    return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None}, progress)
 
 
-def side_by_side(writers: Mapping[str, Callable[[], Texture]]) -> dict[str, Texture]:
-    """Call the writers of images by their names, IMAGES_AT_ONCE at a time, and return what they return."""
+def side_by_side(writers: Mapping[str, Callable[[], Texture]], progress: Progress | None) -> dict[str, Texture]:
+    """Call the writers of images by their names, IMAGES_AT_ONCE at a time, and return what they return: the stage "textures"."""
+    timings = Timings(progress)
+    timings.stage("textures", max(len(writers), 1))
     with ThreadPoolExecutor(IMAGES_AT_ONCE, thread_name_prefix="relit-textures") as pool:
         futures = {name: pool.submit(writer) for name, writer in writers.items()}
         try:
+            for done, future in enumerate(as_completed(futures.values()), start=1):
+                future.result()
+                timings.advance(done)
             return {name: future.result() for name, future in futures.items()}
         except BaseException:
             pool.shutdown(cancel_futures=True)

@@ -19,6 +19,7 @@ from service.asset.content.tangent import vertex_tangents
 from service.asset.content.textures import BLEED_TEXELS, DATA_SPACE, DISPLAY_SPACE, Texture, bleed, encode, encode_normals, side_by_side
 from service.asset.gltf.container import Glb, writing_glb
 from service.errors import AssetError
+from service.reporting.progress import Progress, Timings
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.capture.camera import Camera
 from stage.formats.images import write_png
@@ -39,16 +40,19 @@ NEUTRAL_GREY = 0.18
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                textures: TextureFormat = TextureFormat.PNG16) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a .glb file, whole or not at all.
     `name`: free text; the root node, the mesh and the material are named after it. `textures`: the bits of normals, roughness and metallic;
     colours have 8. Raises AssetError for EXR textures, maps without a height layer or without a face, a colour space that is not known, or
     more than the 4 GiB that a .glb can hold. Raises StorageError if the disk refuses; what was there before is left as it was."""
     target = Path(path)
     check_textures(target, textures)
+    timings = Timings(progress)
+    timings.stage("mesh", 1)
     mesh, look, provenance, unit_m = surface_of(maps)
     with writing_glb(target) as (glb, folder):
-        written = write_textures(maps, mesh, folder, look=look, storage=textures)
+        written = write_textures(maps, mesh, folder, look=look, storage=textures, progress=timings)
+        timings.stage("write", 1)
         material = add_material(glb, written, folder, ior=look.ior if look is not None else GLASS_IOR, name=name)
         surface = add_surface(glb, mesh, unit_m=unit_m, material=material, textured=bool(written), with_tangents=NORMAL in written)
         add_scene(glb, surface, maps.camera, mesh.extent, provenance, name=name, file_name=target.name, version=version, unit_m=unit_m)
@@ -65,6 +69,7 @@ def write_depth(
     geometry: Geometry = Geometry.MESH,  # what the asset is made of; glTF has no variants for both
     version: str = FIRST_VERSION,  # of the asset, kept with the file's name in the extras of `asset`
     textures: TextureFormat = TextureFormat.PNG16,
+    progress: Progress | None = None,
 ) -> tuple[str, ...]:
     """Write a depth as a .glb file, whole or not at all, and return sentences on what the asset lacks.
     Raises AssetError for EXR textures, no point, no face for a mesh, a cloud that is not one of this depth, or more than 4 GiB. Raises
@@ -83,7 +88,7 @@ def write_depth(
             written = {}
             if colours is not None:
                 seen, look = photographed(maps, colours)
-                written = write_textures(seen, mesh, folder, look=look, storage=textures)
+                written = write_textures(seen, mesh, folder, look=look, storage=textures, progress=progress)
             material = add_material(glb, written, folder, name=name)
             primitive = add_surface(glb, mesh, unit_m=1.0, material=material, textured=bool(written), with_tangents=False)
             extent = mesh.extent
@@ -227,7 +232,7 @@ def check_textures(target: Path, storage: TextureFormat) -> None:
 
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None,
-                   storage: TextureFormat = TextureFormat.PNG16) -> dict[str, Texture]:
+                   storage: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> dict[str, Texture]:
     """Write the images that a glTF material of solved maps uses, and return them by name.
 
     METALLIC_ROUGHNESS is there only where a highlight was fitted.
@@ -262,7 +267,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
             writers[METALLIC_ROUGHNESS] = partial(write_metallic_roughness, look, maps.roughness)
     if maps.normal is not None:
         writers[NORMAL] = partial(write_normal, maps.normal)
-    return side_by_side(writers)
+    return side_by_side(writers, progress)
 
 
 def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, name: str, ior: float = GLASS_IOR) -> int:

@@ -12,6 +12,7 @@ from service.asset.usd.materials import define_openpbr_looks
 from service.asset.usd.scene import define_cameras, define_mesh
 from service.asset.usd.surroundings import Surroundings, define_surroundings, writing_asset
 from service.errors import AssetError
+from service.reporting.progress import Progress, Timings
 from service.requests.export import FIRST_VERSION, TextureFormat
 from stage.results.maps import SurfaceMaps
 
@@ -20,7 +21,8 @@ NOTHING = Surroundings()
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, surroundings: Surroundings = NOTHING) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, surroundings: Surroundings = NOTHING,
+                progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a USD asset in the camera frame.
     Raises AssetError for another suffix, EXR textures in a .usdz, lights of a .usdz beside a .usda or .usdc of its name, maps without a
     height layer or without a face, or a colour space that is not known. Raises StorageError if the disk refuses; what was there before is
@@ -36,6 +38,8 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     target = Path(path)
     if check_textures(target, textures) == ".usdz" and (surroundings.rig is not None or surroundings.environment is not None):
         _check_lights_are_free(target)
+    timings = Timings(progress)
+    timings.stage("mesh", 1)
     mesh, look, provenance, unit_m = surface_of(maps)
     meshes = {"mesh": mesh}
     if levels:
@@ -44,7 +48,8 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         meshes |= {f"lod{number}": level for number, level in enumerate(level_meshes(mesh, maps.camera, levels), start=1)}
     with writing_asset(target, Description(name, maps.camera, provenance, unit_m, version)) as files:
         layers = files.layers
-        written = write_textures(maps, mesh, files.textures, look=look, storage=textures)
+        written = write_textures(maps, mesh, files.textures, look=look, storage=textures, progress=timings)
+        timings.stage("write", 1)
         if not maps.camera.metric:
             layers.geometry.GetPrimAtPath(layers.root).SetCustomDataByKey("relit:scale", SCALE_NOTE)
         for variant, each in meshes.items():

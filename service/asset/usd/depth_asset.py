@@ -31,6 +31,7 @@ from service.asset.usd.materials import define_display_color_material, define_lo
 from service.asset.usd.scene import define_cameras, define_mesh, define_points, set_primvar
 from service.asset.usd.surroundings import writing_asset
 from service.errors import AssetError
+from service.reporting.progress import Progress
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps
@@ -48,7 +49,8 @@ class _Parts(NamedTuple):
 
 
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
-                version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
+                version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16,
+                progress: Progress | None = None) -> tuple[str, ...]:
     """Write a depth as a USD asset with a mesh, which is cut at breaks of the depth, and the measured points as variants of `geo`.
     Returns sentences on what the asset lacks. Raises AssetError for another suffix, an EXR texture in a .usdz, no point, no face for a mesh
     that is asked for, or a cloud that is not one of this depth. Raises StorageError if the disk refuses; what was there before is left as
@@ -70,7 +72,7 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
             if variant is Geometry.POINTS:
                 _add_points(layers, parts, maps)
             elif parts.mesh is not None:
-                _add_mesh(layers, parts.mesh, parts.colours, maps, files.textures, textures)
+                _add_mesh(layers, parts.mesh, parts.colours, maps, files.textures, textures, progress)
         define_cameras(layers.geometry, layers.root, maps.camera, parts.points.extent)
         files.beside.extend(sorted(files.textures.iterdir()))
     told = mesh_warnings(parts.mesh, maps) if parts.mesh is not None and geometry is Geometry.MESH else ()
@@ -90,7 +92,7 @@ def _parts(maps: DepthMaps, cloud: PointCloud | None, geometry: Geometry) -> _Pa
 
 
 def _add_mesh(layers: AssetLayers, mesh: SurfaceMesh, colours: np.ndarray | None, maps: DepthMaps, folder: Path,
-              storage: TextureFormat) -> None:
+              storage: TextureFormat, progress: Progress | None) -> None:
     """Define the variant with the mesh, and its looks if its colours are known, whose texture is written into the folder."""
     with layers.geometry_variant(Geometry.MESH) as geom:
         prim = define_mesh(layers.geometry, geom.AppendChild("Mesh"), mesh)
@@ -99,7 +101,7 @@ def _add_mesh(layers: AssetLayers, mesh: SurfaceMesh, colours: np.ndarray | None
         layers.add_surface(prim.GetPath())
     if colours is not None:
         seen, look = photographed(maps, colours)
-        define_looks(layers, write_textures(seen, mesh, folder, look=look, storage=storage), ior=look.ior)
+        define_looks(layers, write_textures(seen, mesh, folder, look=look, storage=storage, progress=progress), ior=look.ior)
 
 
 def _add_points(layers: AssetLayers, parts: _Parts, maps: DepthMaps) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from service.cli.printing import print_lines, print_warnings
-from service.cli.progress import ProgressOption, ProgressStyle, with_bar
+from service.cli.progress import ProgressBar, ProgressOption, ProgressStyle, with_bar
 from service.cli.request_commands import local_command, product_command
 from service.requests.basis import BasisRequest
 from service.requests.export import BlenderExtensionRequest, ExportRequest, InspectRequest
@@ -56,7 +56,9 @@ def _inspect(request: InspectRequest) -> None:
     inspect = INSPECTED.get(path.suffix.lower())
     if inspect is None:
         raise AssetError(f"{path}: relit inspect reads {', '.join(INSPECTED)}")
-    found = inspect(path)
+    with ProgressBar() as bar:
+        bar.stage("inspect", 1)
+        found = inspect(path)
     if request.as_json:
         plain = found._asdict() | {"parts": [part._asdict() for part in found.parts]}
         print(json.dumps(plain, ensure_ascii=False, indent=2, default=str))

@@ -186,6 +186,7 @@ class _Walk:
         if self._supported and self._once:
             self._shape_of(self._clear(light.arriving), light, self._shape.short_tails)
         relative = self._given.relative and self._options.scale
+        self._given.timings.stage("bounced", 1)
         settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative, direct=self._resumed)
         self._unknown_bounce = settled.degrees
         self.result.facts |= settled.report(relative=relative)

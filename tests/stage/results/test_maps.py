@@ -137,7 +137,8 @@ def test_layers_are_named_masked_and_of_their_type(tmp_path):
     rng, mask = np.random.default_rng(0), np.array([[True, False, True], [True, True, False]])
     layers = [rng.normal(size=(3, 2, 3)).astype(np.float16), rng.normal(size=(3, 2, 3)).astype(np.float32)]
     layers[1][:, ~mask] = np.nan
-    write_layers(tmp_path / "b.exr", layers, mask, color_space="lin_ap1_scene", metadata={"relit:capture": "owl"})
+    write_layers(tmp_path / "b.exr", layers, mask, color_space="lin_ap1_scene", metadata={"relit:capture": "owl"},
+                 progress=lambda rows: None)
     channels, metadata = exr.read(tmp_path / "b.exr")
     assert set(channels) == {f"basis.{k:03d}.{c}" for k in (0, 1) for c in "RGB"} | {"mask.Y"}
     for k, layer in enumerate(layers):
