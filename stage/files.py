@@ -14,7 +14,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from stage.errors import StorageError, storage
@@ -89,13 +89,13 @@ def write_text(path: str | Path, text: str) -> None:
 @contextmanager
 def folder_beside(path: str | Path) -> Iterator[Path]:
     """Yield a temporary folder beside `path`, which none but its owner reads and which is removed at the end."""
-    target = Path(path).absolute()
-    with _locked(target, lambda: tempfile.mkdtemp(prefix=f".{target.stem}.{_MARK}", dir=target.parent)) as temporary:
-        try:
-            with storage("write", path):
-                yield temporary
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with _folder(Path(path).absolute()) as temporary, storage("write", path):
+        yield temporary
+
+
+def temporary_folder(name: str) -> AbstractContextManager[Path]:
+    """Return a temporary folder where the system has them, named after what it is for, which is removed at the end."""
+    return _folder(Path(tempfile.gettempdir(), name))
 
 
 @contextmanager
@@ -121,6 +121,15 @@ def resolved(path: Path) -> Path | None:
         return path.resolve()
     except (OSError, RuntimeError, ValueError):
         return None
+
+
+@contextmanager
+def _folder(target: Path) -> Iterator[Path]:
+    with _locked(target, lambda: tempfile.mkdtemp(prefix=f".{target.stem}.{_MARK}", dir=target.parent)) as temporary:
+        try:
+            yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """Read the tiles of a board: depth results as they are, captures decoded by the depth product."""
 
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from service.reporting.progress import Progress
 from service.requests.depth import DepthRequest
 from stage.capture.manifest import FILE_NAME
 from stage.errors import BoardError, ManifestError
+from stage.files import temporary_folder
 from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.sets.board import SCAN_FILE, BoardScan, Tile
@@ -76,8 +76,8 @@ def _maps(file: Path, tile: Tile, device: str | None, cache: Path | None) -> Dep
     if not (folder / FILE_NAME).is_file():
         raise ManifestError(f"{file}: tiles: {tile.path} holds neither {DEPTH_FILE} nor {FILE_NAME}: give folders of depth results or "
                             "captures")
-    with tempfile.TemporaryDirectory(prefix="relit-tile-") as out:
-        maps = depth(DepthRequest(capture=folder, out=Path(out), device=device, cache=None if cache is None else cache / tile.path)).maps
+    with temporary_folder("tile") as out:
+        maps = depth(DepthRequest(capture=folder, out=out, device=device, cache=None if cache is None else cache / tile.path)).maps
     if not isinstance(maps, DepthMaps):
         raise ManifestError(f"{folder / FILE_NAME}: projector is missing: its pixels have projector coordinates and no depth in metres")
     return maps

@@ -32,7 +32,7 @@ class Writer(NamedTuple):
     """(DepthMaps, PointCloud | None, path, *, name, geometry, version, textures, progress): a depth; returns sentences on what the
     asset lacks."""
     fused: Callable[..., None] = _refuse
-    """(UnwrappedMesh, BakedImages, path, *, name, provenance): a fused surface with textures."""
+    """(UnwrappedMesh, BakedImages, path, *, name, provenance, progress): a fused surface with textures."""
     mesh: Callable[..., None] = _refuse
     """(TriangleMesh, path, *, comments): a fused surface, or a tile of one, with colours and other values at its vertices."""
     inspect: Callable[[Path], Inspection] | None = None

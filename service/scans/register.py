@@ -1,7 +1,6 @@
 """Register a scan set: scan-set.json with the poses and their covariances, and report.json."""
 
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -35,7 +34,7 @@ from service.scans.registration_words import (
     wrong_targets,
 )
 from stage.errors import ScanError
-from stage.files import write_text
+from stage.files import temporary_folder, write_text
 from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, rotation_warnings, write_scan_set
 
 
@@ -130,7 +129,7 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
     with ExitStack() as held:
         pieces = sharing
         if pieces is None:
-            folder = request.cache or Path(held.enter_context(tempfile.TemporaryDirectory(prefix="relit-register-")))
+            folder = request.cache or held.enter_context(temporary_folder("register"))
             pieces = SharedPieces(FolderPieces(folder))
         places = [file.parent / path for entry in listed.scans for path in (entry.path, entry.image) if path is not None]
         pieces.identify(listed.model_dump_json(), stamps(places, timed=sharing is None), tuple(versions().items()))

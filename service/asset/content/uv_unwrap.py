@@ -1,5 +1,12 @@
-"""A mesh of triangles with fewer faces and texture coordinates, as the textured asset of a fusion has it."""
+"""A mesh of triangles with fewer faces and texture coordinates, as the textured asset of a fusion has it.
 
+The libraries that make it work for minutes without a look at signals, and let no other thread run: they have a process of their own.
+"""
+
+import io
+import os
+import subprocess
+import sys
 from typing import Any, NamedTuple
 
 import fast_simplification
@@ -39,24 +46,36 @@ def textured_mesh(points: np.ndarray, faces: np.ndarray, *, most_faces: int, tex
         Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997, as fast-simplification does it; Young,
         xatlas, after Lévy et al., "Least squares conformal maps", SIGGRAPH 2002.
     """
-    xatlas = unwrapper()
-    middle = points.mean(axis=0)
-    places, triangles = (points - middle).astype(np.float32), faces.astype(np.int32)
-    if len(triangles) > most_faces:
-        places, triangles = fast_simplification.simplify(places, triangles, target_count=most_faces)
-    places, triangles = _manifold(places, triangles)
+    unwrapper()
+    middle, given = points.mean(axis=0), io.BytesIO()
+    np.savez(given, places=(points - middle).astype(np.float32), triangles=faces.astype(np.int32), most_faces=most_faces,
+             texture_px=texture_px)
+    done = subprocess.run([sys.executable, "-P", "-m", __name__], input=given.getvalue(), capture_output=True, start_new_session=True,
+                          env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))})
+    if done.returncode:
+        raise AssetError(f"the asset: texture coordinates for {most_faces} faces failed (exit code {done.returncode}): give fewer "
+                         "--texture-faces, or --no-texture")
+    places, triangles, place, indices, st = np.load(io.BytesIO(done.stdout)).values()
     none = np.zeros((0, 4), dtype=np.int32)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(places, triangles.astype(np.uint32))
-    pack = xatlas.PackOptions()
-    pack.padding, pack.resolution, pack.create_image = PADDING_TEXELS, texture_px, False
-    atlas.generate(pack_options=pack)
-    place, indices, st = atlas[0]
     pixel = np.zeros(len(place), dtype=np.int64)
     world = (places.astype(np.float64) + middle).astype(np.float32)
     normals = _normals(places, triangles)
     mesh = SurfaceMesh(world[place], normals[place], st.astype(np.float32), none, indices.astype(np.int32), pixel, pixel, 1, len(place))
     return UnwrappedMesh(mesh, place.astype(np.int64))
+
+
+def _unwrap(places: np.ndarray, triangles: np.ndarray, most_faces: int, texture_px: int) -> tuple[np.ndarray, ...]:
+    """Return the vertices and faces that are left, and of the unwrapped mesh the number of the place of each vertex, its faces, and st."""
+    xatlas = unwrapper()
+    if len(triangles) > most_faces:
+        places, triangles = fast_simplification.simplify(places, triangles, target_count=most_faces)
+    places, triangles = _manifold(places, triangles)
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(places, triangles.astype(np.uint32))
+    pack = xatlas.PackOptions()
+    pack.padding, pack.resolution, pack.create_image = PADDING_TEXELS, texture_px, False
+    atlas.generate(pack_options=pack)
+    return places, triangles, *atlas[0]
 
 
 def _manifold(places: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,3 +131,8 @@ def _normals(places: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     own = np.zeros(normals.shape, dtype=np.float32)
     own[triangles.ravel()] = np.repeat(face, 3, axis=0)
     return np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, own)
+
+
+if __name__ == "__main__":
+    asked = np.load(io.BytesIO(sys.stdin.buffer.read()))
+    np.savez(sys.stdout.buffer, *_unwrap(asked["places"], asked["triangles"], int(asked["most_faces"]), int(asked["texture_px"])))

@@ -18,18 +18,20 @@ from service.asset.usd.layers import Description, define_root, prim_name
 from service.asset.usd.materials import define_openpbr_looks
 from service.asset.usd.scene import define_polygons
 from service.asset.usd.surroundings import writing_asset
+from service.reporting.progress import Progress
 from stage.colour.colour import convert
 from stage.results.mesh import TriangleMesh
 
 
-def write_fused(unwrapped: UnwrappedMesh, baked: BakedImages, path: Path, *, name: str, provenance: dict[str, str]) -> None:
+def write_fused(unwrapped: UnwrappedMesh, baked: BakedImages, path: Path, *, name: str, provenance: dict[str, str],
+                progress: Progress | None = None) -> None:
     """Write a fused surface in the world frame, with the images over its texture, as a USD asset.
     Raises AssetError for another suffix. Raises StorageError if the disk refuses; what was there before is left as it was."""
     maps = baked.maps
     look = metallic_look(maps) if maps.diffuse_albedo is not None else None
     with writing_asset(path, Description(name, None, provenance)) as files:
         layers = files.layers
-        textures = write_textures(maps, unwrapped.mesh, files.textures, look=look, tangent=baked.normal)
+        textures = write_textures(maps, unwrapped.mesh, files.textures, look=look, tangent=baked.normal, progress=progress)
         with layers.geometry_variant("mesh") as geom:
             layers.add_surface(_define_mesh(layers.geometry, geom.AppendChild("Mesh"), unwrapped).GetPath())
         files.beside.extend(define_openpbr_looks(layers, files.textures, textures, look))

@@ -139,8 +139,9 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
     facts["holes"]["closed"] = closed
     baked = None
     if request.texture:
-        timings.stage("texture", 1)
+        timings.stage("unwrap", 1)
         textured = textured_mesh(surface.points, surface.faces, most_faces=request.texture_faces, texture_px=request.texture_px)
+        timings.stage("texture", 1)
         scans = [fused.scan(place) for place in range(len(fused.used))]
         baked = textured, bake(textured.mesh, scans, fused.names, fused.voxel, request.texture_px, device=device)
     timings.stage("write", 1)
@@ -150,7 +151,9 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
         asset_path = request.out / ASSET_FILE
         facts["texture"] = {"vertices": int(baked[0].place.max()) + 1, "faces": len(baked[0].mesh.triangles),
                             "seen_share": round(baked[1].seen_share, 4)}
-        WRITERS[asset_path.suffix].fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance)
+        WRITERS[asset_path.suffix].fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance,
+                                         progress=timings)
+        timings.stage("mesh", 1)
     mesh_path = request.out / MESH_FILE
     WRITERS[mesh_path.suffix].mesh(mesh, mesh_path, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
     return _Made(mesh_path, asset_path, facts)

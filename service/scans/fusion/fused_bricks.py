@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +26,7 @@ from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.sharing.sharing import digest, kind_of_worker
+from stage.files import temporary_folder
 from stage.formats.npy import packed, unpacked
 from stage.sets.scan_set import read_scan_set
 
@@ -67,7 +67,7 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
     alone = distinct(file, whole)
     scan_set = alone.scans
     with ExitStack() as held:
-        work = Path(held.enter_context(TemporaryDirectory(prefix="relit-fuse-")))
+        work = held.enter_context(temporary_folder("fuse"))
         pieces = sharing or SharedPieces(FolderPieces(request.cache or work / "pieces"))
         device = devices.resolve(request.device)
         places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
