@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -232,7 +232,16 @@ class Recorded:
     def run(self) -> None:
         """Run the threads; returns as `launch` does."""
         if len(self._commands) > 1:
-            list(_pool(worker_count()).map(lambda command: command.launch(), self._commands))
+            pool = _pool(worker_count())
+            pieces = [pool.submit(command.launch) for command in self._commands]
+            try:
+                for piece in pieces:
+                    piece.result()
+            except BaseException:  # of Ctrl-C, too: the arrays that the others write to must not go before them
+                for piece in pieces:
+                    piece.cancel()
+                wait(pieces)
+                raise
         elif self._commands:
             self._commands[0].launch()
 

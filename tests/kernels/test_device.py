@@ -2,6 +2,7 @@ import ast
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,26 @@ def test_a_launch_visits_every_index_once(count, device):
     visits = wp.zeros(count + 3, dtype=int, device=device)
     devices.launch(count_visits, count, [2], [visits], device=device)
     np.testing.assert_array_equal(visits.numpy(), [2] * count + [0] * 3)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_an_interrupted_launch_waits_for_its_other_pieces(error):
+    """Their arrays go when the caller has the error; a piece that was not begun is not begun."""
+    begun, ended = [], []
+
+    def fails():
+        while devices.worker_count() > 1 and not begun:
+            time.sleep(0.001)
+        raise error
+
+    def works():
+        begun.append(1)
+        time.sleep(0.05)
+        ended.append(1)
+
+    with pytest.raises(error):
+        devices.Recorded([SimpleNamespace(launch=launch) for launch in (fails, *[works] * 50)]).run()
+    assert len(begun) == len(ended) < 50
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs cores that can be chosen")
