@@ -93,10 +93,11 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     if not neighbours_are_installed():
         raise RequestError("a scan is laid on its design with small_gicp, which is not installed: pip install 'relit[scans]'")
     timings = Timings(progress)
-    timings.stage("read", 1)
+    timings.stage("design", 1)
     regions, unit_m = _regions(request)
     device = devices.resolve(request.device)
     design = read_design(request.design, UNITS_M[request.design_unit], device=device)
+    timings.stage("scan", 1)
     scan = read_scanned(request.scan, UNITS_M[request.scan_unit], request.sigma_m)
     reach = request.reach_m or REACH * design.size
     _check_limits(request, design, reach, regions, unit_m)
@@ -105,6 +106,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     timings.stage("deviations", 1)
     found = deviations_of(design, scan, placement, reach)
     sigma = sigma_of(found, placement, request.shared_sigma_m)
+    timings.stage("patches", 1)
     spacing = _spacing(scan.points)
     patch = PATCH_SPACINGS * spacing if request.smallest_fault_m is None else request.smallest_fault_m / 2
     patches = patches_of(found, design, placement, patch_m=patch, shared_m=request.shared_sigma_m)

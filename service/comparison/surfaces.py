@@ -109,10 +109,13 @@ class Design:
 
 def _turned_edges(faces: np.ndarray) -> int:
     """Return at how many edges more faces run one way than the other way by two: of consistent surfaces it is one, at a border."""
-    once = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+    a, b, c = np.sort(faces, axis=1).astype(np.int64).T
+    count = faces.max() + np.int64(1)
+    _, side = np.unique(a * count + b, return_inverse=True)  # numbers, which sort three times as fast as rows
+    once = faces[np.unique(side * count + c, return_index=True)[1]].astype(np.int64)
     start, end = once.reshape(-1), np.roll(once, -1, axis=1).reshape(-1)
-    _, edge = np.unique(np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1), axis=0, return_inverse=True)
-    return int((np.abs(np.bincount(edge.reshape(-1), np.where(start < end, 1, -1))) > 1).sum())
+    _, edge = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True)
+    return int((np.abs(np.bincount(edge, np.where(start < end, 1, -1))) > 1).sum())
 
 
 def read_design(path: Path, unit_m: float, *, device: str) -> Design:

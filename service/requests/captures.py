@@ -23,7 +23,7 @@ class InfoRequest(ReviewOptions, PixelOptions):
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
-    picture: Annotated[Path | None, AfterValidator(_png), Role.RUN] = None
+    picture: Annotated[Path | None, AfterValidator(_png), Role.FILE] = None
     """PNG that shows what was understood: the lights on the dome with their images, those that disagree with the others in red, the mask,
     and how bright the readings are."""
 
