@@ -70,16 +70,6 @@ def require_writable(path: Path, *, folder: bool = False) -> None:
         raise StorageError(f"cannot write {path}: permission denied")
 
 
-def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files and folders that killed processes left in a folder."""
-    with storage("write", folder):
-        for path in folder.glob(".*"):
-            if _TEMPORARY.fullmatch(path.name) and (lock := _lock(path)) is not None:
-                if _MARK in path.name or os.fstat(lock).st_mtime < time.time() - _DAY_S:
-                    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-                os.close(lock)
-
-
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file whole or not at all."""
     with replacing(path) as temporary:
@@ -139,7 +129,7 @@ def _locked(target: Path, make: Callable[[], str]) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.parent not in _swept:
             _swept.add(target.parent)
-            remove_unfinished(target.parent)
+            _remove_unfinished(target.parent)
         while (lock := _lock(temporary := Path(make()), wait=True)) is None and not temporary.exists():
             pass  # another process took it for one that was left, before it had its lock
     try:
@@ -147,6 +137,16 @@ def _locked(target: Path, make: Callable[[], str]) -> Iterator[Path]:
     finally:
         if lock is not None:
             os.close(lock)
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove the temporary files and folders that killed processes left in a folder."""
+    with storage("write", folder):
+        for path in folder.glob(".*"):
+            if _TEMPORARY.fullmatch(path.name) and (lock := _lock(path)) is not None:
+                if _MARK in path.name or os.fstat(lock).st_mtime < time.time() - _DAY_S:
+                    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+                os.close(lock)
 
 
 def _lock(path: Path, *, wait: bool = False) -> int | None:

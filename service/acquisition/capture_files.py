@@ -22,7 +22,7 @@ from service.errors import RequestError
 from stage.capture.manifest import FILE_NAME, SCHEMA, Manifest, write_manifest
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
-from stage.files import remove_unfinished, replacing
+from stage.files import replacing
 from stage.importers.camera_options import View
 from stage.importers.layout import assumed_encoding, color_space_of, image_resolution
 from stage.rig.rig import Rig
@@ -37,10 +37,8 @@ class CaptureFiles:
 
     def __init__(self, folder: Path, rig: Rig, shots: Sequence[Shot], color_space: ColorSpaceName | None, saturation: float | None
                  ) -> None:
-        """Take the folder of the journal over, without the half-written files of a run that was killed."""
+        """Take the folder of the journal over."""
         self._folder, self._rig, self._shots, self._color_space, self._saturation = folder, rig, shots, color_space, saturation
-        for name in {REJECTED, "", *(shot.folder for shot in shots)}:
-            remove_unfinished(folder / name)
 
     def path_of(self, shot: Shot, suffix: str) -> Path:
         """Return the path of the picture of a shot."""

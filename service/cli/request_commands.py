@@ -38,7 +38,6 @@ from pydantic import BeforeValidator, ValidationError
 from service.cli.colours import OcioOption, colours
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
-from service.reporting.progress import Progress
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, require_outputs, typed, typed_name
 
@@ -92,20 +91,18 @@ def product_command(group: typer.Typer, name: str, model: type[Options], product
 
     def run(request: model) -> None:  # type: ignore[valid-type]
         work = resolve_name(product)
-        told = "progress" in inspect.signature(work).parameters
-        result = with_bar(work if told else partial(_in_one_stage, name, work), request)
+
+        def in_one_stage(request: Options, progress: Any) -> Any:
+            progress.stage(name, 1)
+            return work(request)
+
+        result = with_bar(work if "progress" in inspect.signature(work).parameters else in_one_stage, request)
         succeeded = show(result, request) if with_request else show(result)
         print_warnings(getattr(result, "warnings", ()))
         if succeeded is False:
             raise typer.Exit(1)
 
     local_command(group, name, run)
-
-
-def _in_one_stage(name: str, work: Callable[[Any], Any], request: Any, progress: Progress) -> Any:
-    """Do work that tells no progress, as one stage with the name of the command."""
-    progress.stage(name, 1)
-    return work(request)
 
 
 def command(group: typer.Typer, name: str, function: Callable[..., None], *, without: frozenset[Role] = frozenset(),
