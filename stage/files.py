@@ -15,6 +15,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from stage.errors import StorageError, storage
@@ -23,7 +24,7 @@ _umask_lock = threading.Lock()
 _MARK = f"relit-{zlib.crc32(platform.node().encode()):08x}-"
 _TEMPORARY = re.compile(r"\..+\.relit-[0-9a-f]{8}-[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., the mark, eight characters of mkstemp, SUFFIX
 _DAY_S = 86400
-_swept: set[Path] = set()
+_FOLDERS = 1024  # whose sweep a process remembers
 
 
 @contextmanager
@@ -127,9 +128,7 @@ def _locked(target: Path, make: Callable[[], str]) -> Iterator[Path]:
     """Yield the temporary file or folder that is made beside a target, locked; what killed processes left there is removed first."""
     with storage("write", target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.parent not in _swept:
-            _swept.add(target.parent)
-            _remove_unfinished(target.parent)
+        _remove_unfinished(target.parent)
         while (lock := _lock(temporary := Path(make()), wait=True)) is None and not temporary.exists():
             pass  # another process took it for one that was left, before it had its lock
     try:
@@ -139,8 +138,9 @@ def _locked(target: Path, make: Callable[[], str]) -> Iterator[Path]:
             os.close(lock)
 
 
+@lru_cache(_FOLDERS)
 def _remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files and folders that killed processes left in a folder."""
+    """Remove the temporary files and folders that killed processes left in a folder, once in the life of this one."""
     with storage("write", folder):
         for path in folder.glob(".*"):
             if _TEMPORARY.fullmatch(path.name) and (lock := _lock(path)) is not None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kernels.photometric.search.certainty import MOST
 from service.solve.inside_pixels import SPOT, unseen_bend
 
 ROWS, COLS = 12, 30
@@ -53,3 +54,12 @@ def test_the_size_of_pieces_changes_nothing(monkeypatch):
     whole = unseen_bend(normal, sigma, solved)
     monkeypatch.setattr("service.solve.inside_pixels.BAND_PIXELS", 2 * COLS)
     np.testing.assert_array_equal(unseen_bend(normal, sigma, solved), whole)
+
+
+def test_what_is_hardly_known_gets_no_worse():
+    """Normals at random, of every σ up to the largest."""
+    random = np.random.default_rng(2)
+    normal = random.normal(size=(3, ROWS, COLS))
+    sigma = MOST * random.random((ROWS, COLS))
+    found = unseen_bend(normal / np.linalg.norm(normal, axis=0), sigma, np.ones((ROWS, COLS), bool))
+    assert 0.999 * MOST < np.hypot(found, sigma).max() < 1.001 * MOST  # float32
