@@ -152,8 +152,8 @@ def _check_order(capture: Capture, samples: StripeSamples, counts: list[int], al
 
 def _second_stripes(doubled: list[str], frames: int) -> str:
     return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe beside the "
-            "first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
-            "status multipath")
+            "first, as of two planes at a time, which the manifest does not declare, a reflection, or surfaces one behind the other that "
+            "one plane meets; their doubtful points have the status multipath")
 
 
 def _sweeps(frames: list[Frame], correction: Correction, background: np.ndarray, mask: np.ndarray, timings: Timings) -> dict[str, Sweep]:

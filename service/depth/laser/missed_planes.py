@@ -20,9 +20,11 @@ AROUND = 2
 LEAST_LINES = 16
 """Number of lines that must tell a step."""
 NEAR, AGREEING = 0.5, 0.75
-"""Distance from the median, as a part of it or of one step, within which this part of the lines must move."""
+"""Distance from the median, in steps, within which this part of the lines must move."""
 WHOLE = 0.15
-"""Largest distance of the median from a whole number of steps, as a part of it or of one step."""
+"""Largest distance of the median from a whole number of steps, in steps. As a part of the median it took three steps and a half for
+four: of 160 simulated right sweeps, half of them over plates and pillars with upright edges, 23 were told, now 6; of as many with a frame
+missing, doubled or exchanged 86 to 95 % were, now 78 to 93 %."""
 SHARE = 0.1
 """Part of the frames that lie equally many planes aside, from which on they may be the ones that are right."""
 
@@ -57,8 +59,8 @@ def missteps(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], cam
             continue
         part = moved[number, told] / np.nanmedian(around[:, told], axis=0)
         middle = float(np.median(part))
-        steps, size = round(middle), max(1.0, abs(middle))
-        if steps != 1 and abs(middle - steps) < WHOLE * size and (np.abs(part - middle) < NEAR * size).mean() > AGREEING:
+        steps = round(middle)
+        if steps != 1 and abs(middle - steps) < WHOLE and (np.abs(part - middle) < NEAR).mean() > AGREEING:
             found.append(Misstep(number + 1, steps))
     return [] if len(found) == 1 and found[0].planes < 0 else found  # as where a second stripe is taken for the first in one frame
 
@@ -86,4 +88,5 @@ def missed_sentence(steps: Sequence[Misstep], images: Sequence[str]) -> str:
         f"moves {-first.planes} planes back")
     more = f", and {len(steps) - 1} more such steps" if len(steps) > 1 else ""
     return (f"frames[].laser: from {images[first.frame - 1]} to {images[first.frame]} the stripe {moves} where their planes are one apart"
-            f"{more}: frames are missing, doubled or in another order; the standard deviations hold what that makes of the depths")
+            f"{more}: frames are missing, doubled or in another order, or an edge of depth lies along the stripe there; the standard "
+            "deviations hold what missing frames make of the depths")
