@@ -18,6 +18,13 @@ def tukey_weights(left: np.ndarray, scale: float | np.ndarray) -> np.ndarray:
     return np.asarray(np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None)))
 
 
+def blocks_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the block of each place of an image, [values] below BLOCKS²: as many places stand in each column, and in each row, of blocks.
+    `x`, `y`: [values] places across and down, in any unit."""
+    across, down = (np.searchsorted(np.quantile(places, np.arange(1, BLOCKS) / BLOCKS), places) for places in (x, y))
+    return np.asarray(across * BLOCKS + down)
+
+
 def between_blocks(covariance: np.ndarray, scores: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the covariance of fitted parameters for what whole blocks of an image leave alike, [parameters, parameters].
 
@@ -30,7 +37,6 @@ def between_blocks(covariance: np.ndarray, scores: np.ndarray, x: np.ndarray, y:
         x: [values] places across the image, in any unit.
         y: [values] places down the image, in any unit.
     """
-    across, down = (np.searchsorted(np.quantile(places, np.arange(1, BLOCKS) / BLOCKS), places) for places in (x, y))
     sums = np.zeros((BLOCKS**2, scores.shape[1]))
-    np.add.at(sums, across * BLOCKS + down, scores)
+    np.add.at(sums, blocks_of(x, y), scores)
     return np.asarray(covariance @ (sums.T @ sums) @ covariance)

@@ -14,7 +14,20 @@ from service.depth.base.epipolar import VIEW, Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.readings import full_scale
-from service.depth.stereo.camera_doubts import ENOUGH, as_camera, as_projector, by_chance, contradicted, sentence, widened
+from service.depth.stereo.camera_doubts import (
+    ENOUGH,
+    SAID_PX,
+    UNEXPLAINED_PX,
+    as_camera,
+    as_projector,
+    by_chance,
+    contradicted,
+    sentence,
+    unexplained_px,
+    unexplained_sentence,
+    widened,
+    widened_along,
+)
 from service.depth.stereo.rectification import Rectification, RectifiedFrames, pose_of, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import (
     LEAST_PLACES,
@@ -141,6 +154,11 @@ def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthR
             facts["refined"] = view_facts(view, "camera_from_other", view.camera_from_projector)
         warnings.append(sentence(f"other_cameras[{index}], {other.name}", contradiction, given, capture.camera))
         pair = pair._replace(sigma=widened(pair.depth, pair.sigma, capture.camera, contradiction, given))
+    elif len(offsets.offset) >= ENOUGH and (unexplained := unexplained_px(offsets)) > UNEXPLAINED_PX:
+        facts["unexplained_px"] = _short(unexplained)
+        if unexplained > SAID_PX:
+            warnings.append(unexplained_sentence(f"other_cameras[{index}], {other.name}", unexplained))
+        pair = pair._replace(sigma=widened_along(pair.depth, pair.sigma, geometry, unexplained))
     if not believed and request.least_confidence is None:
         pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))
     return Measured(pair, facts, warnings)

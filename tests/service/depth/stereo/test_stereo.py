@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from kernels.status import Status
 from service.calibrate.solvers.procam import board_points
 from service.calibrate.stereo import BoardFrame, calibrate
+from service.depth.stereo.camera_doubts import unexplained_px
+from service.depth.stereo.row_offsets import RowOffsets
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
@@ -141,6 +143,18 @@ def test_a_wrong_calibration_is_named_held_by_sigma_and_refined(relit, tmp_path,
 
 
 @pytest.mark.long
+def test_a_lens_distortion_that_was_left_out_is_held_by_sigma(relit, tmp_path):
+    """No turn explains where the rows lie then: 27 % of the depths are beyond five σ if it does not hold that."""
+    left, right, _ = seen("plane and sphere")
+    folder = write(tmp_path, left.images, right.images)
+    edit_manifest(folder, camera=lambda camera: {**camera, "distortion": None},
+                  other_cameras=lambda others: [{**others[0], "distortion": None}])
+    maps, report, _ = relit.depth(folder)
+    assert report["found"]["cameras"][0]["unexplained_px"] > 0.1
+    assert (np.abs(maps.depth - left.depth)[maps.mask] > 5 * maps.sigma[maps.mask]).mean() < 0.01
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_cameras_that_boards_have_calibrated_raise_no_doubt(relit, tmp_path, seed):
     """Corners with noise of .05 px leave distortions and principal points open, whose rows lie .1 px apart in the corners of the image."""
@@ -231,3 +245,13 @@ def test_images_of_other_moments_give_no_depth(relit, tmp_path, mirrored):
     assert outcome.code == 1 and "no depth is trusted" in outcome.out
     maps = DepthMaps.read(folder / "out" / "depth.exr", unsure=True)
     assert not maps.mask.any() and maps.confidence.max() <= 0.1
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1, 0.3])
+def test_what_whole_blocks_of_row_offsets_have_alike_is_told_from_their_noise(size):
+    """The medians of 25 blocks of 40 places with noise of .05 px leave .01 px; they even out a wave within a block by a tenth."""
+    random = np.random.default_rng(7)
+    row, col = random.integers(0, 240, 1000), random.integers(0, 320, 1000)
+    wave = np.sqrt(2) * size * np.sin(2 * np.pi * row / 240)
+    offsets = RowOffsets(row, col, np.zeros(1000), wave + random.normal(0, 0.05, 1000), np.full(1000, 0.05))
+    assert abs(unexplained_px(offsets) - size) < 0.01 + 0.1 * size
