@@ -60,7 +60,7 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
 def require_writable(path: Path, *, folder: bool = False) -> None:
     """Raise StorageError unless a file, or with `folder` the files of a folder, can be made at a path, whose missing parents are made with
     it."""
-    if not folder and path.is_dir():
+    if not folder and os.path.isdir(path):  # False of names that are too long, which others refuse with a number
         raise StorageError(f"cannot write {path}: is a directory")
     existing = path if folder else path.parent
     while not existing.exists() and existing != existing.parent:

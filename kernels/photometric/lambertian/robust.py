@@ -26,7 +26,9 @@ BRIGHT_FRACTION = 0.1
 """Fraction of the lights whose readings exceed the bright end of a pixel, so that single highlights lie above it."""
 ONE_HIGHLIGHT = 5
 """Least number of readings of which one exceeds the bright end in any case: the light of one highlight leaves what determines a normal and
-checks it."""
+checks it. Readings that would be in shadow beside it agree with no fit all the same: tails of a metal's highlight pass for plaster."""
+TIED = 1e-4
+"""Part by which a reading must exceed a bound that is no rank's value: exactly a tenth, as eight bits often are, is shadow."""
 SHADOW_FRACTION = 0.1
 """Fraction of the bright end below which a reading is in shadow, attached or cast."""
 DARK_RANKS = 0.2
@@ -131,9 +133,11 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                 halve(middle[k], above[k] > outshining[k], low[k], high[k])
 
         # among the lit lights, the values between which the kept ranks lie
-        shadow, lit = float_pack(), float_pack()
+        shadow, sure, lit = float_pack(), float_pack(), float_pack()
         for k in range(pack):
             shadow[k] = SHADOW_FRACTION * high[k]
+            alone = BRIGHT_FRACTION * given[k] - 0.5 < 1.0
+            sure[k] = wp.where(alone, wp.static(SHADOW_FRACTION * (1.0 + TIED)) * top[k], shadow[k])
         for light in range(light_count):
             y = readings[start + light * light_stride]
             for k in range(pack):
@@ -209,7 +213,7 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                 if y[k] > shadow[k]:
                     checks[k] += 1.0
                     square = wp.static((CAUCHY_SCALE / AGREES)**2) * off * off
-                    agreeing[k] += 1.0 / (1.0 + square * square)
+                    agreeing[k] += wp.where(y[k] > sure[k], 1.0 / (1.0 + square * square), 0.0)
                 elif y[k] > 0.0 and y[k] < MISSING * expected and expected > wp.static(EXPECTED / CAUCHY_SCALE) * reach[k]:
                     checks[k] += 1.0
             readings[at] = weight
