@@ -1,5 +1,5 @@
 """The reflectance model in float64, from the papers: GGX (Walter 2007, equation 33), Smith's height-correlated masking from its Λ
-(Heitz 2014, equations 72 and 99), Schlick 1994, Burley 2012 section 5.3. Imports nothing of ours."""
+(Heitz 2014, equations 72 and 99), brushed GGX from its slopes, Schlick 1994, Burley 2012 section 5.3. Imports nothing of ours."""
 
 import numpy as np
 
@@ -34,6 +34,21 @@ def specular(normal, light, view, alpha, f0, gamma=GGX):
     masking = 1 / (1 + smith_lambda(safe, alpha) + smith_lambda(nv, alpha))
     fresnel = f0 + (1 - f0) * (1 - hv) ** 5
     return np.where(lit, distribution(np.maximum(nh, 1e-6), alpha, gamma) * masking * fresnel / (4 * nv), 0.0)
+
+
+def streak(normal, tangent, light, view, widths, f0):
+    """BRDF · n·l of a brushed lobe with widths along and across a tangent, by the slopes of its facets (Heitz 2014, equations 81, 84 and
+    99); 0 for lights below the horizon. Broadcasts over leading axes."""
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=-2)
+    light, view = (np.einsum("...ij,...j->...i", frame, way) for way in (light, view))
+    half = unit(light + view)
+    lit = light[..., 2] > 1e-9
+    safe = np.where(lit[..., None], light, [0.0, 0.0, 1.0])
+    slopes = ((half[..., :2] / np.maximum(half[..., 2:], 1e-6) / widths) ** 2).sum(-1)
+    facets = 1 / (np.pi * np.prod(widths) * (1 + slopes) ** 2 * np.maximum(half[..., 2], 1e-6) ** 4)
+    masked = [(np.sqrt(1 + ((way[..., :2] * widths) ** 2).sum(-1) / way[..., 2] ** 2) - 1) / 2 for way in (safe, view)]
+    fresnel = f0 + (1 - f0) * (1 - (half * view).sum(-1)) ** 5
+    return np.where(lit, facets * fresnel / (4 * view[..., 2] * (1 + masked[0] + masked[1])), 0.0)
 
 
 def diffuse(normal, light, view, rough=None, slope=0.0, facets=0.0):

@@ -30,7 +30,7 @@ checks it."""
 OUTSHINES = 1.5
 """Brightness, over that of the next reading, from which on readings that would be in shadow beside it agree with no fit: the tail of a
 metal's highlight passes for plaster. On plaster with metal parts under 6 to 14 lights, as many normals are beyond five σ as where one
-highlight makes shadows of all others; with 2, a third more."""
+highlight makes shadows of all others; with 2, two fifths more."""
 TIED = 1e-4
 """Part by which a reading must exceed a bound that is no rank's value: exactly a tenth, as eight bits often are, is shadow."""
 SHADOW_FRACTION = 0.1

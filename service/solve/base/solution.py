@@ -107,6 +107,7 @@ class Solution:
     pair: np.ndarray | None = None  # [pixels] uint8, which pair these are
     pairs: np.ndarray | None = None  # [pairs, 2, 4] float32, F0 and roughness of both materials; None: no pixel has two
     blurred: np.ndarray | None = None  # [n] positions of metals that were found by the moments of their readings; None: of none
+    brushed: np.ndarray | None = None  # [n] positions of pixels with a streak for a highlight; None: of none
     specular_normal: np.ndarray | None = None  # [3, pixels] float32
     regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.posterior.sampling.Regime
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet
@@ -139,6 +140,11 @@ class Solution:
         specular = self.specular.copy()
         specular[:, self.blurred] = 0
         return specular
+
+    @property
+    def mostly_brushed(self) -> bool:
+        """Whether more than half of the pixels that have a normal are brushed."""
+        return self.brushed is not None and 2 * len(self.brushed) > np.isin(self.status, ESTIMATED).sum()
 
     @property
     def confidence(self) -> np.ndarray:

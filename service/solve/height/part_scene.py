@@ -52,6 +52,7 @@ class Material(NamedTuple):
     albedo: np.ndarray  # [3, pixels]
     specular: np.ndarray | None = None  # [3, pixels]
     roughness: np.ndarray | None = None  # [pixels]
+    brushed: np.ndarray | None = None  # [n] positions of pixels with a streak for a highlight, beside which they are dark without a shadow
 
     def grey(self, pixels: np.ndarray) -> np.ndarray:
         """Return [n, 3] grey albedo, grey F0 and roughness of some pixels."""
@@ -87,6 +88,8 @@ class PartScene:
         readings = readings_of(pick_pixels(given, lights, view, pixels))[:, lit]
         toward = lights.direction[: given.stack.light_count][lit].astype(np.float64)
         self._odds = shadow_odds(readings, toward, normal[:, pixels].T, view(pixels), material.grey(pixels), device=given.device)
+        if material.brushed is not None:
+            self._odds[np.isin(pixels, material.brushed)] = 0
         around = np.argsort(np.arctan2(toward[:, 1], toward[:, 0]))
         self._group = np.empty(len(lit), dtype=int)
         self._group[around] = np.arange(len(lit)) * GROUPS // len(lit)

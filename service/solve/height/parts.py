@@ -162,7 +162,7 @@ def place_solution(given: SolveInput, lights: DistantLights, solution: Solution,
         return None
     given.timings.stage("parts", 1)
     padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
-    material = Material(solution.albedo, solution.specular, solution.roughness)
+    material = Material(solution.albedo, solution.specular, solution.roughness, solution.brushed)
     solution.integration, placement = place_parts(given, padded, solution.normal, material, solution.integration, solution.height,
                                                   again, solution.standard_error().reshape(given.mask.shape) < AMBIGUOUS_DEGREES)
     solution.facts["unexplained_shadows"] = round(placement.unexplained, 3)

@@ -40,6 +40,7 @@ from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.interreflection import ArrivingLight
 from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
+from service.solve.methods.brushed import place_brushed
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.material_options import WHOLE_SOLVER, MaterialOptions
@@ -102,6 +103,7 @@ class _Walk:
         self._shape, self._lobe, self._shape_spread = LobeShape(), LobeShape(), UNKNOWN_SPREAD
         self._resumed = False
         self._supported, self._pull, self._simpler = True, 0.0, Method.LAMBERT
+        self._unsupported: str | None = None  # what few lights do not support
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -143,6 +145,7 @@ class _Walk:
             pixels = np.concatenate([start, start + APART]) if len(start) else np.tile(self._spread, 2)
             support = support_of(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
             self._supported, self._pull, self._simpler = support.lobes, support.pull, support.simpler
+            self._unsupported = support.warning
             self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
         if self._supported:
             self._shape_of(self._spread, light)
@@ -287,6 +290,10 @@ class _Walk:
         if self._given.stack.light_count >= LEAST_LIGHTS:
             blurred = place_blurred_metals(result, misread, shape, read)
             abundance[blurred], own[:, blurred], tilt[:, blurred] = 0, 0, 0
+        if not self._matt:
+            abundance[place_brushed(result, self._solvable, shape, self._pick, self._given.timings, lobe=self._lobe)] = 0
+        if self._unsupported and not result.mostly_brushed:
+            result.warnings.append(self._unsupported)
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, kinds.pairs
             result.facts["mixed_pixels"] = int(mixed.sum())

@@ -155,6 +155,8 @@ class Support(NamedTuple):
     """The simpler method that predicts left-out lights better, of LAMBERT and ROBUST."""
     pull: float = 0.0
     """Strength of the prior towards its normals."""
+    warning: str | None = None
+    """The sentence that says what speaks against the solver; None: nothing."""
 
 
 def is_supported(general: float, lambert: float) -> bool:
@@ -163,15 +165,14 @@ def is_supported(general: float, lambert: float) -> bool:
 
 
 def support_of(result: Solution, samples: Samples, start: np.ndarray, *, matt: bool) -> Support:
-    """Return how far few lights support the general solver, and say in the solution what speaks against it; parameters as of leave_out.
+    """Return how far few lights support the general solver, and note in the solution what was measured; parameters as of leave_out.
     `matt`: the images hold diffuse light alone, so that no specular lobe is expected."""
     count = samples.light_count
 
     def fall_back(reason: str, simpler: Method, pull: float = UNSUPPORTED_PULL) -> Support:
-        result.warnings.append(f"method svbrdf: {reason}: normals are drawn to those of {simpler.value}"
-                               f"{'' if matt else ' and no specular lobe is estimated'}; capture 32 lights or more, spread over the "
-                               "hemisphere, or take --method robust.")
-        return Support(pull == DOUBTFUL_PULL, simpler, pull)
+        return Support(pull == DOUBTFUL_PULL, simpler, pull, f"method svbrdf: {reason}: normals are drawn to those of {simpler.value}"
+                       f"{'' if matt else ' and no specular lobe is estimated'}; capture 32 lights or more, spread over the hemisphere, or "
+                       "take --method robust.")
 
     if count < TESTED_LIGHTS:
         return fall_back(f"{count} lights are fewer than the unknowns of a pixel", Method.LAMBERT)
@@ -194,6 +195,11 @@ def raise_undescribed(solution: Solution) -> None:
     least = min(general, lambert, robust)
     if is_supported(general, lambert) or least < UNDESCRIBED or shared < SHARED:
         return
-    raise_error(solution, DEGREES * least)
-    solution.warnings.append("method svbrdf: the object reflects neither by Lambert's law nor with highlights, as velvet does not: the "
-                             "normals are only as sure as the layer sigma says; a ball of its material tells more (--reference-ball)")
+    degrees = np.full(solution.status.shape, DEGREES * least)
+    if solution.brushed is not None:
+        degrees[solution.brushed] = 0
+    raise_error(solution, degrees)
+    if not solution.mostly_brushed:
+        solution.warnings.append("method svbrdf: the object reflects neither by Lambert's law nor with highlights, as velvet does not: "
+                                 "the normals are only as sure as the layer sigma says; a ball of its material tells more "
+                                 "(--reference-ball)")
