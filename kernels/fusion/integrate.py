@@ -120,7 +120,6 @@ def _integrate_kernel(first: int, count: int, watched: wp.array2d(dtype=wp.int16
     normals = wp.vec3(0.0, 0.0, 0.0)
     nearest = float(1.0e30)
     reference = wp.vec3(0.0, 0.0, 0.0)
-    measured = wp.int32(0)
     near = wp.int32(0)
     empty = wp.int32(0)
     for k in range(count):
@@ -139,7 +138,6 @@ def _integrate_kernel(first: int, count: int, watched: wp.array2d(dtype=wp.int16
                 total += w * reading.distance
                 spread += w * w * reading.variance
                 normals += w * turned_back(view, reading.normal)
-                measured += 1
                 if wp.abs(reading.distance) <= near_surface(reading.sigma, voxel):
                     near += 1
                 if wp.abs(reading.distance) < nearest:
@@ -150,11 +148,10 @@ def _integrate_kernel(first: int, count: int, watched: wp.array2d(dtype=wp.int16
                     empty += 1
             elif is_clear(view, there, uv, truncation(0.0, voxel), images.clear):
                 empty += 1
-    if measured > 0 and wp.length(normals) < AGREEING * weights:
+    if weights > 0.0 and wp.length(normals) < AGREEING * weights:
         weights = float(0.0)
         total = float(0.0)
         spread = float(0.0)
-        measured = wp.int32(0)
         for k in range(count):
             number = int(watched[block, k])
             if number < 0:
@@ -170,12 +167,12 @@ def _integrate_kernel(first: int, count: int, watched: wp.array2d(dtype=wp.int16
                     weights += w
                     total += w * reading.distance
                     spread += w * w * reading.variance
-                    measured += 1
     known = wp.int32(UNKNOWN)
-    if measured > 0:
+    if weights > 0.0:
         known = wp.int32(SURFACE)
         voxels.value[i] = total / weights
-        voxels.variance[i] = spread / (weights * weights)
+        apart = wp.abs(total / weights) - nearest  # beside edges views differ by more than their noise: of two, this is that of the mean
+        voxels.variance[i] = wp.max(spread / (weights * weights), apart * apart)
     if empty > 0 and empty >= near and total <= 0.0:
         known = wp.int32(EMPTY)
     voxels.state[i] = wp.uint8(known)

@@ -19,6 +19,9 @@ TILE = 4
 LATERAL = 0.1
 """Standard deviation of the place of a reading across the line of sight, in pixels, as calibrations and optics leave it. Seen at a grazing
 angle it is what limits a measurement, whatever the standard deviation of the depth."""
+BEND = 0.3
+"""Standard deviation of the distance of a reading, in pixels, times the bend of the surface between its four pixels, which is 0.7 where two
+of them face at a right angle to the others: what lies between pixels is not known, and edges are rounded."""
 SPACING = 0.29
 """Standard deviation in pixels that the weights of readings use in its place: that of a uniform distribution over a pixel, 1/√12. The chord
 between pixels cuts a bent surface short, more so at grazing angles; that error does not average out."""
@@ -78,7 +81,7 @@ class Cell:
     weight: float  # 1 / square metres, inverse square of `sigma`; 0 where nothing can be read
     sigma: float  # metres, standard deviation along the normal of the reading of one pixel, as readings are weighted
     along: float  # square metres, variance along the normal that the depth of one pixel has
-    lateral: float  # square metres, variance along the normal that the place across the line of sight has
+    lateral: float  # square metres, variance along the normal that the place across the line of sight and the bend between pixels have
     largest: float  # metres, largest standard deviation along the line of sight
 
 
@@ -238,7 +241,7 @@ def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=
             across = pixel * pixel * (1.0 - cosine * cosine)
             found.normal = n
             found.along = one * one * toward * toward
-            found.lateral = LATERAL * LATERAL * across
+            found.lateral = LATERAL * LATERAL * across + BEND * BEND * pixel * pixel * (1.0 - shared * shared / 16.0)
             found.weight = 1.0 / (found.along + SPACING * SPACING * across)
             found.sigma = wp.sqrt(found.along + SPACING * SPACING * across)
     cells[i] = found

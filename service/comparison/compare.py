@@ -40,6 +40,8 @@ REACH = 0.02
 """The part of the design's size within which points belong to it."""
 PATCH_SPACINGS = 4.0
 """Side of a patch in distances of neighbouring points: it holds some sixteen."""
+ROUNDED_SPACINGS = 4.0
+"""The distance from the design, in those of neighbouring points, up to which a scan rounds its edges."""
 SPACING_POINTS = 2000
 """Points whose distances to their neighbours are looked at."""
 NEIGHBOUR = 4
@@ -110,7 +112,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     spacing = _spacing(scan.points)
     patch = PATCH_SPACINGS * spacing if request.smallest_fault_m is None else request.smallest_fault_m / 2
     patches = patches_of(found, design, placement, patch_m=patch, shared_m=request.shared_sigma_m)
-    strange = standing_on(design, found, patches, patch_m=patch)
+    strange = standing_on(design, found, patches, patch_m=patch, rounded_m=min(ROUNDED_SPACINGS * spacing, reach))
     verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
                          least_seen=request.least_seen, one_pose=not placement.rivals)
     size = size_of(patches, placement.pivot)

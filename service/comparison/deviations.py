@@ -25,10 +25,15 @@ LEAST_POINTS = 4
 """The fewest points of a patch that is judged."""
 BY_CHANCE = 1e-5
 """Probability of a scatter in a patch from which σ of the points does not explain it, and the scatter itself counts."""
+ACROSS, TURNED = 0.2, 0.2
+"""Standard deviation of the place of a surface along itself, in distances of neighbouring points: scans round edges by about their
+resolution. Times the length by which the mean normals of scan and design differ it is an error across the surface, which the points of a
+patch share. Shorter ones are noise of the normals."""
 NEARBY = 0.25
 """The part of the design's size within which points that do not lie on it are taken for something that stands on it."""
-SAMPLES, BESIDE = 40_000, 0.1
-"""Points of the design on which others may stand, and how far beside the surface these may lie along it, in sides of a patch."""
+SAMPLES, BESIDE, AROUND = 40_000, 0.1, 16
+"""Points of the design on which others may stand, how far beside the surface these may lie along it, in sides of a patch, and how many
+points of the design tell whether there is an edge."""
 REGIONS_FILE = "regions.csv"
 REGION_SAMPLES = 40_000
 """Points of the design that tell how much of it the scan shows."""
@@ -50,6 +55,7 @@ class Deviations(NamedTuple):
     face: np.ndarray  # [m] int32
     moves: np.ndarray  # [m, 6] float32: what a small motion of the scan adds to the distance
     noise: np.ndarray  # [m] metres: σ of the point itself
+    turned: np.ndarray  # [m, 3] float32: its normal less that of the design; 0 where that is not its own
 
 
 class Patches(NamedTuple):
@@ -77,18 +83,23 @@ def deviations_of(design: Design, scan: ScannedSurface, placement: Placement, re
     near, distance, across, at, face = (np.concatenate(each) for each in zip(*parts, strict=True))
     if not len(near):
         raise ScanError(f"the scan does not lie on the design: no point comes within {1e3 * reach_m:.3g} mm of it and faces the same way")
+    turned = (normals[near] - design.normals[face]) * scan.told[near, None]
     return Deviations(placed.astype(np.float32), normals.astype(np.float32), near, distance, at, face,
-                      gradient(at, across, placement.pivot).astype(np.float32), scan.sigma[near])
+                      gradient(at, across, placement.pivot).astype(np.float32), scan.sigma[near], turned.astype(np.float32))
 
 
-def standing_on(design: Design, found: Deviations, patches: Patches, *, patch_m: float) -> tuple[np.ndarray, np.ndarray]:
+def standing_on(design: Design, found: Deviations, patches: Patches, *, patch_m: float, rounded_m: float
+                ) -> tuple[np.ndarray, np.ndarray]:
     """Return places of the design [k, 3], metres, and its normals there [k, 3], above or below which enough points for a patch lie that do
     not belong to it: something else stands there, or the part is not what was designed. They stand on what is nearest, and on what is
-    before or behind them and faces as they do: the floor of a deep pocket may be nearer to the other side of its wall."""
+    before or behind them and faces as they do: the floor of a deep pocket may be nearer to the other side of its wall. Points that come
+    within `rounded_m` of both sides of an edge are that edge, as the scan rounds it."""
     others, normals = (np.delete(each, found.near, axis=0).astype(np.float64) for each in (found.placed, found.normals))
     reach = NEARBY * design.size
-    there = [design.offsets(others, reach)]
     samples, face = design.sample(SAMPLES)
+    away = ~_at_edge(samples, design.normals[face], others, rounded_m)
+    others, normals = others[away], normals[away]
+    there = [design.offsets(others, reach)]
     tree = cKDTree(np.concatenate([samples, reach * design.normals[face]], axis=1))
     nearest = tree.query(np.concatenate([others, reach * normals], axis=1))[1]
     across = design.normals[face[nearest]]
@@ -103,6 +114,13 @@ def standing_on(design: Design, found: Deviations, patches: Patches, *, patch_m:
         places.append((each.at[many], design.normals[each.face[many]]))
     at, facing = (np.concatenate(each) for each in zip(*places, strict=True))
     return at, facing
+
+
+def _at_edge(samples: np.ndarray, facing: np.ndarray, points: np.ndarray, within_m: float) -> np.ndarray:
+    """Return which points [n, 3] have samples of a surface around them, [k, 3] with their normals [k, 3], of two sides of an edge."""
+    near, found = cKDTree(samples).query(points, k=AROUND, distance_upper_bound=within_m)
+    cosine = np.einsum("nki,ni->nk", *(np.append(facing, [[0, 0, 0]], axis=0)[each] for each in (found, found[:, 0])))
+    return np.asarray((np.isfinite(near) & (np.abs(cosine) < ALIKE)).any(axis=1))
 
 
 def sigma_of(found: Deviations, placement: Placement, shared_m: float) -> np.ndarray:
@@ -132,9 +150,12 @@ def patches_of(found: Deviations, design: Design, placement: Placement, *, patch
     unlike = scatter > noise * chdtri(count[kept] - 1, BY_CHANCE) / (count[kept] - 1)  # stray points, or a fault in a part of the patch
     noise = np.where(unlike, scatter, noise)
     middle, across = mean(found.at), mean(normal)
+    turned = np.linalg.norm(mean(found.turned), axis=1)
+    spacing = patch_m / np.sqrt(np.median(count[kept])) if kept.any() else 0.0
+    alone = noise / count[kept] + np.where(turned > TURNED, ACROSS * spacing * turned, 0) ** 2  # each patch without those around
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-    together = shared_error(deviation, noise / count[kept], middle, across, patch_m)
-    noise = noise / count[kept] + np.minimum(together**2, noise) * (1 - 1 / count[kept])  # a mean errs by no more than its points
+    together = shared_error(deviation, alone, middle, across, patch_m)
+    noise = alone + np.minimum(together**2, noise) * (1 - 1 / count[kept])  # a mean errs by no more than its points
     pose = np.einsum("pi,ij,pj->p", moves, placement.covariance, moves)
     return Patches(middle, across, deviation, np.sqrt(noise + pose + shared_m**2), count[kept], together)
 

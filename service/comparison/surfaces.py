@@ -36,6 +36,7 @@ class ScannedSurface(NamedTuple):
     sigma_source: str
     """`measured` (in the file), `declared` (an option) or `estimated` (from the scatter around local planes)."""
     faces: np.ndarray | None  # [f, 3] int; None: it is a set of points
+    told: np.ndarray  # [n] bool: the normal is that of the point, and not of the nearest that has one
 
     @property
     def size(self) -> float:
@@ -170,7 +171,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         if not np.isfinite(scatter):
             raise ResultError(f"{file}: its {len(points)} points are too few or too far apart to tell their σ: give --sigma-m")
         spread = np.full(len(points), scatter)
-    return ScannedSurface(points, outward, spread, source, faces)
+    return ScannedSurface(points, outward, spread, source, faces, ~bare)
 
 
 def _once(ply: PlyPoints, faces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None]:
