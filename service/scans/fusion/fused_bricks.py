@@ -20,7 +20,7 @@ from service.requests.register import FuseRequest, Misplaced
 from service.scans.duplicates import distinct
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, elsewhere, place_scans, reach_of, readings_of
-from service.scans.fusion.other_readings import LEAST_SCANS, common_scale, meant_otherwise
+from service.scans.fusion.other_readings import LEAST_SCANS, Moved, common_scale, in_another_order, meant_otherwise
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma
@@ -108,11 +108,19 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     scan_names = [summary.name for summary in summaries]
     warnings = [*placing_warnings(scan_names, placings, request.misplaced), *_pair_warnings(scan_names, elsewhere(samples, readings).pairs)]
     words, poses = None, scans.poses()
-    if poses is not None and (meant := meant_otherwise(samples, readings, poses, lambda at, moved: read("otherwise", at, moved.scan))):
+    doubtful = [number for number, placing in enumerate(placings) if placing.misplaced or placing.compared < LEAST_COMMON]
+
+    def otherwise(at: list[Sample], moved: Moved) -> list[Readings]:
+        return read("otherwise", at, moved.scan)
+
+    if poses is not None and (meant := meant_otherwise(samples, readings, poses, otherwise)):
         words = f"scans[].scan_to_world: {meant}"
     elif (scale := _scale_that_fits(summaries, placings, readings, voxel)) is not None:
         words = (f"several scans lie beside the others, and all fit if their coordinates are multiplied by {scale:.4f}, or the "
                  f"translations of their poses by {1 / scale:.4f}: the unit or the calibration of one of the two is wrong")
+    elif poses is not None and any(placing.misplaced for placing in placings) and (
+            order := in_another_order(samples, readings, poses, scan_names, doubtful, otherwise)):
+        words = f"scans[].scan_to_world: {order}"
     if words is not None:
         if request.misplaced is Misplaced.LEAVE_OUT:
             raise RequestError(f"{file}: {words}; --misplaced keep fuses them as they are")
@@ -121,7 +129,8 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     if len(scans) > 1 and request.misplaced is Misplaced.LEAVE_OUT and all(placing.compared < LEAST_COMMON for placing in placings):
         raise RequestError(f"{file}: scans[].scan_to_world: no two of the {len(scans)} scans have a surface in common: look whether "
                            "lengths are in metres and poses scan_to_world; --misplaced keep fuses scans of several things")
-    if 2 * len(used) < len(scans) + any(placing.against for placing in placings) or not used:
+    confirmed = sum(placings[number].compared >= LEAST_COMMON for number in used)
+    if len(used) < len(scans) and 2 * confirmed <= len(scans):
         raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
 
     timings.stage("bricks", len(used))

@@ -4,7 +4,8 @@ About an axis of a round body inverted poses lay scans on each other over most o
 Where poses are right and their unit or calibration is not, each surface grows about its own scanner, and every scan seems misplaced.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,9 @@ coarse; of inverted ones about a body that is not nearly the same all around its
 FAR_BETTER = 0.5
 """Part of the contradicting points that may be left with poses that are read otherwise: where these are the right ones .01 to .44 are, and
 where the poses as given are, 2.3 times as many or more contradict."""
+FEW_DOUBTFUL, MOST_CONTRADICTING = 4, 0.05
+"""Most scans at wrong places of which any two are tried exchanged, of more the whole list is tried in other orders; and largest part of the
+points in common that contradict in the right one."""
 LEAST_SCANS = 3
 """Fewest scans whose scale can be told from their places: two that lie apart along their lines of sight fit at some scale too."""
 OPENCV = np.eye(4)
@@ -101,8 +105,44 @@ def meant_otherwise(samples: list[Sample], readings: list[Readings], poses: list
     if not fitting:
         return None
     _, _, words, found = min(fitting)
+    return f"{_said(words, found, given)}: write them as scan_to_world"
+
+
+def in_another_order(samples: list[Sample], readings: list[Readings], poses: list[np.ndarray], names: Sequence[str], doubtful: list[int],
+                     read: Callable[[list[Sample], Moved], list[Readings]]) -> str | None:
+    """Return in which order the poses must be for scans to lie on each other better than as given, in words; None: there is none.
+
+    `names`: of the scans. `doubtful`: numbers of those that lie beside the others or have no surface in common with them. The rest is
+    as of `meant_otherwise`."""
+    given, everyone = agreement(samples, readings), [*range(len(poses))]
+    orders: dict[str, list[int]] = {}
+    if len(doubtful) <= FEW_DOUBTFUL:
+        for one, two in combinations(doubtful, 2):
+            exchanged = {one: two, two: one}
+            orders[f"the poses of {names[one]} and {names[two]} are exchanged"] = [exchanged.get(number, number) for number in everyone]
+    elif 2 * len(doubtful) >= len(poses):
+        as_text = sorted(everyone, key=str)
+        orders = {"the poses are in the opposite order, as where a table turns the other way": everyone[::-1],
+                  "each pose is that of the scan before": everyone[1:] + everyone[:1],
+                  "each pose is that of the scan after": everyone[-1:] + everyone[:-1],
+                  "the poses are in the order of their numbers as text (1, 10, 11, 2)": np.argsort(as_text).tolist(),
+                  "the scans are in the order of their numbers as text (1, 10, 11, 2)": as_text}
+    fitting: list[tuple[int, str, Agreement]] = []
+    for words, order in orders.items():
+        moved = Moved(poses, [poses[number] for number in order])
+        there = [moved.sample(number, sample) for number, sample in enumerate(samples)]
+        found = agreement(there, read(there, moved))
+        if found.contradicting <= MOST_CONTRADICTING and found.agreeing >= given.agreeing + 2 * LEAST_COMMON:
+            fitting.append((found.agreeing, words, found))
+    if not fitting:
+        return None
+    _, words, found = max(fitting)
+    return f"{_said(words, found, given)}: put them in that order"
+
+
+def _said(words: str, found: Agreement, given: Agreement) -> str:
     return (f"{words}: read so, {found.agreeing} points of scans lie on other scans and {found.common - found.agreeing} beside "
-            f"them, and {given.agreeing} and {given.common - given.agreeing} as they are: write them as scan_to_world")
+            f"them, and {given.agreeing} and {given.common - given.agreeing} as they are")
 
 
 def common_scale(samples: list[Sample], readings: list[Readings], scanners: np.ndarray) -> tuple[float, list[Readings]]:

@@ -117,6 +117,19 @@ def test_a_scan_that_is_turned_by_90_degrees_is_told_by_what_others_saw_through(
     assert f"view {turned}" in found.warnings[0] and words in found.warnings[0]
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("order", "words"), [
+    ([1, 0, *range(2, 12)], "the poses of view 0 and view 1 are exchanged"),  # one of them was fused, 77 mm off
+    ([*range(1, 12), 0], "each pose is that of the scan after"),
+    ([*range(11, -1, -1)], "the poses are in the opposite order"),
+    (sorted(range(12), key=str), "the poses are in the order of their numbers as text"),
+    ([2, 7, 10, 0, 5, 3, 9, 1, 6, 11, 4, 8], "the poses contradict each other: run relit register first")])
+def test_poses_in_another_order_are_named(tmp_path, order, words):
+    shots = turntable(12, (96, 72), range_m=2.0)
+    with pytest.raises(RequestError, match=words):
+        fuse_scans(write_scans(tmp_path, shots, poses=[shots[number].world_from_camera for number in order]), tmp_path / "out")
+
+
 def arc(folder, poses=None):
     """Three scans of the statue, 20 degrees apart, in the world frame of the first."""
     shots = [shoot(place(np.radians(angle), 0.1, 2.0), (80, 60), 130.0, seed=angle) for angle in (0, 20, 40)]
