@@ -16,7 +16,7 @@ from service.scans.points.rigid import applied, moved
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
 from service.scans.registration.pairs import FEATURE_CELLS, MOST_POSES, ROUGH_POINTS
 from stage.errors import ScanError
-from stage.spread import MAD_TO_SIGMA, tukey_weights
+from stage.spread import MAD_TO_SIGMA, TUKEY, tukey_weights
 
 CELLS_ACROSS = 60
 """The size of the design in cells of the rough scale."""
@@ -103,8 +103,8 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
         fitted = _closest(design, scan, drawn[:SOME], [pose for pose, score in found if score <= RIVAL * least], coarse)
         _refuse_turned(design, scan, drawn, coarse, fitted)
         rivals = sum(score <= RIVAL * least and not is_near(pose, fitted, middle, 3 * coarse) for pose, score in found)
-    for reach in (1.5 * coarse, max(0.75 * coarse, reach_m), reach_m):
-        step = _fit(design, scan, drawn[:MANY], fitted, reach)
+    for reach, kept in ((1.5 * coarse, 1.5 * coarse), (max(0.75 * coarse, reach_m), 0.75 * coarse), (reach_m, 0.0)):
+        step = _fit(design, scan, drawn[:MANY], fitted, reach, kept_m=kept)  # the few points of walls decide before they stand off
         if step is None:
             raise ScanError(_unlike(design, scan, drawn[:SOME], fitted, reach_m))
         fitted, last = step.pose, step
@@ -232,8 +232,9 @@ def _matched(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.nd
 
 
 def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float, wanted: Wanted | None = None, *,
-         still: float = STILL) -> _Fit | None:
-    """Return the pose near another that brings points of a scan onto the design; None if too few can be matched."""
+         still: float = STILL, kept_m: float = 0.0) -> _Fit | None:
+    """Return the pose near another that brings points of a scan onto the design; None if too few can be matched.
+    `kept_m`: distance within which points count whatever the others say: where most lie on planes, those that tell the rest stand off."""
     covariance, held, pivot, open_still = np.zeros((6, 6)), 6, np.zeros(3), np.eye(6)
     for _ in range(STEPS):
         found, points = _matched(design, scan, rows, pose, reach)
@@ -245,7 +246,7 @@ def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarra
         placed = found.at + found.across * found.distance[:, None]
         pivot = placed.mean(axis=0)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(found.distance)))
-        weight = tukey_weights(found.distance, max(spread, float(np.median(scan.sigma))))
+        weight = tukey_weights(found.distance, max(spread, float(np.median(scan.sigma)), kept_m / TUKEY))
         jacobian = gradient(placed, found.across, pivot)
         size = float(np.sqrt(np.mean((placed - pivot) ** 2) * 3))
         units = np.array([1 / size] * 3 + [1.0] * 3)

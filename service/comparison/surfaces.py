@@ -36,7 +36,7 @@ class ScannedSurface(NamedTuple):
     sigma_source: str
     """`measured` (in the file), `declared` (an option) or `estimated` (from the scatter around local planes)."""
     faces: np.ndarray | None  # [f, 3] int; None: it is a set of points
-    told: np.ndarray  # [n] bool: the normal is that of the point, and not of the nearest that has one
+    told: np.ndarray  # [n] bool: the normal is that of the point, and not of the nearest that has one, or fitted to those around
 
     @property
     def size(self) -> float:
@@ -151,6 +151,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         points, normals, sigma = points * unit_m, None, None
     if len(points) < LEAST_SCAN:
         raise ResultError(f"{file}: has {len(points)} different points: {LEAST_SCAN} are the fewest that are compared")
+    fitted = normals is None and faces is None
     if normals is None:
         normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
     normals = np.nan_to_num(normals, posinf=0, neginf=0)
@@ -171,7 +172,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         if not np.isfinite(scatter):
             raise ResultError(f"{file}: its {len(points)} points are too few or too far apart to tell their σ: give --sigma-m")
         spread = np.full(len(points), scatter)
-    return ScannedSurface(points, outward, spread, source, faces, ~bare)
+    return ScannedSurface(points, outward, spread, source, faces, ~bare & (not fitted))
 
 
 def _once(ply: PlyPoints, faces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None]:
