@@ -48,6 +48,8 @@ LISTED_HOLES = 50
 """Holes that the report lists, the longest first."""
 LOST_SHARE = 0.05
 """Share of the pixels of a scan that may lie at no fused surface before it is said."""
+LEAST_THROUGH = 0.01
+"""Share of the pixels of a scan whose places others saw to be empty from which on its pose may be why; of right poses some at edges are."""
 MANY_CONTRADICTED = 0.25
 """Part of the vertices with photometric normals at which these may contradict the depth before it is said."""
 FAR_SIGMAS = 1.5
@@ -204,8 +206,11 @@ def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
         if not scan["fused"]:
             continue
         if (share := scan["lost_share"] + scan["seen_through_share"]) > LOST_SHARE:
-            yield (f"scan {scan['name']}: {share:.0%} of its pixels are not on the fused surface ({scan['seen_through_share']:.0%} because "
-                   "other scans saw their places to be empty): a part may be thinner than two voxels, or the pose wrong")
+            through = scan["seen_through_share"]
+            yield f"scan {scan['name']}: {share:.0%} of its pixels are not on the fused surface" + (
+                f" ({through:.0%} because other scans saw their places to be empty): a part may be thinner than two voxels, or the pose "
+                "wrong"
+                if through > LEAST_THROUGH else ": they lie at borders and holes of what it measured, or on parts thinner than two voxels")
         if scan["residual_median_sigmas"] > FAR_SIGMAS:
             yield (f"scan {scan['name']}: its pixels lie {scan['residual_median_sigmas']:.2g} of their σ from the fused surface in the "
                    "median, where 0.67 is expected: its σ is too small, its pose wrong, or the voxels too large for what it shows")

@@ -105,6 +105,14 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     assert warning.startswith("scan view 2: ")
 
 
+def test_holes_of_a_right_scan_do_not_accuse_its_pose(tmp_path, shots):
+    """A scan that is alone cannot lie elsewhere."""
+    random = np.random.default_rng(0)
+    alone = shots[0]._replace(mask=shots[0].mask & (random.random(shots[0].mask.shape) > 0.1))
+    (warning,) = fuse_scans(write_scans(tmp_path, [alone]), tmp_path / "out").warnings
+    assert "borders and holes" in warning and "pose" not in warning
+
+
 def test_a_mesh_without_holes_says_what_is_invented(tmp_path, shots):
     file = write_scans(tmp_path, shots[::5], coloured=True)
     measured, closed = (fuse_scans(file, tmp_path / close, voxel_m=2 * VOXEL, close=close) for close in ("none", "all"))
