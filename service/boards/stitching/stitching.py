@@ -12,6 +12,7 @@ from service.boards.stitching.blending import Blender, TileErrors, grid_points
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch
 from service.boards.stitching.motions import Motions, displace, solve_motions
 from service.boards.stitching.overlap import UNKNOWNS, Evidence, Overlap, choose_candidate, measure_overlap
+from service.boards.stitching.trends import trend_sentences
 from stage.errors import BoardError
 
 SEARCH_SIGMA = 3.0
@@ -125,7 +126,11 @@ def stitch(
     noise = max(1.0, float(np.median([overlap.noise_factor for overlap in used]))) if used else 1.0
     shared = float(np.sqrt(np.mean([overlap.shared_m**2 for overlap in used]) + motions.misfit_m**2)) if used else 0.0
     each = _tile_noise(overlaps, len(tiles), noise)
-    said = [*_warnings(tiles, overlaps, motions, noise, each), *_far(tiles, motions, middles / length, shift_sigma)]
+    measured = _measured(overlaps, motions)
+    said = [*_warnings(tiles, overlaps, measured, motions, noise, each), *_far(tiles, motions, middles / length, shift_sigma),
+            *trend_sentences(middles, motions, np.isin(np.arange(len(tiles)), list(measured)), length_m=length, pixel_m=pixel,
+                             tile_m=float(np.median([max(tile.corners[1] - tile.corners[0]) for tile in tiles])) / 2,
+                             sigma_m=noise * float(np.median([np.median(tile.sigma) for tile in tiles])))]
     return Stitched(grid, centre, length, motions, overlaps, noise, each, shared, said)
 
 
@@ -274,7 +279,13 @@ def _far(tiles: Sequence[TilePoints], motions: Motions, middles: np.ndarray, shi
             for tile, distance in zip(tiles, away, strict=True) if distance > FAR_SIGMA * shift_sigma_m]
 
 
-def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap], motions: Motions, noise: float,
+def _measured(overlaps: dict[tuple[int, int], Overlap], motions: Motions) -> set[int]:
+    """Return the tiles whose shift an overlap tells."""
+    return {tile for pair, overlap in overlaps.items() if overlap.evidence is Evidence.SHIFT and pair not in motions.contradicted
+            for tile in pair}
+
+
+def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap], measured: set[int], motions: Motions, noise: float,
               tile_noise: np.ndarray) -> list[str]:
     found = []
     if len(tiles) == 1:
@@ -285,8 +296,6 @@ def _warnings(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overl
                          f"{overlap.correlation:.2f}): their overlap is not used")
     for i, j in motions.contradicted:
         found.append(f"tiles {tiles[i].name} and {tiles[j].name}: the other overlaps contradict the shift of theirs, which is not used")
-    measured = {tile for pair, overlap in overlaps.items() if overlap.evidence is Evidence.SHIFT and pair not in motions.contradicted
-                for tile in pair}
     placed = [tile.name for number, tile in enumerate(tiles) if number not in measured]
     if placed:
         found.append(f"{len(placed)} of {len(tiles)} tiles have too little relief in their overlaps to measure a shift "
