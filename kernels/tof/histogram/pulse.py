@@ -43,6 +43,10 @@ class Pulse(NamedTuple):
         times = self.begin + self.step * np.arange(len(self.density))
         return float((times * self.density).sum() / self.density.sum())
 
+    def stretched(self, factor: float) -> "Pulse":
+        """Return the pulse that is so many times as long."""
+        return Pulse(factor * self.begin, factor * self.step, self.cumulative, self.density / factor)
+
 
 def gaussian(sigma_bins: float) -> Pulse:
     """Return a Gaussian pulse of this standard deviation in bins, jitter of the detector included."""
@@ -77,6 +81,17 @@ def with_tail(sigma_bins: float, tail_bins: float, part: float) -> Pulse:
     delayed = np.convolve(density, decay / decay.sum())[: len(density)]
     power = (1 - part) * density + part * delayed
     return _tabulated(-prompt.step * int(np.argmax(power)), prompt.step, power)
+
+
+def flat_topped(sigma_bins: float, flat_bins: float) -> Pulse:
+    """Return a pulse that is on for `flat_bins`, a laser driven for longer than it takes to switch, seen with a Gaussian jitter of
+    `sigma_bins`; time 0 is its middle."""
+    edge = gaussian(sigma_bins)
+    half = 0.5 * flat_bins
+    steps = int(np.ceil((half - edge.begin) / edge.step))
+    away = edge.step * np.arange(-steps, steps + 1)
+    lit = np.interp(away + half, edge.begin + edge.step * np.arange(len(edge.cumulative)), edge.cumulative)
+    return _tabulated(-steps * edge.step, edge.step, np.maximum(lit + lit[::-1] - 1, 0))
 
 
 def measured(times_bins: Sequence[float] | np.ndarray, power: Sequence[float] | np.ndarray) -> Pulse:

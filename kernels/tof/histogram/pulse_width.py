@@ -1,6 +1,6 @@
 """The shape of the pulse, estimated from the histograms: the one under which the brightest of them are most likely."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import product
 from typing import NamedTuple
 
@@ -9,11 +9,12 @@ import numpy as np
 from kernels.device import to_numpy
 from kernels.errors import ArrayError
 from kernels.tof.histogram.pileup import LiveCounts
-from kernels.tof.histogram.pulse import Pulse, gaussian, with_tail
+from kernels.tof.histogram.pulse import Pulse, flat_topped, gaussian, with_tail
 from kernels.tof.histogram.returns import find_returns, threshold
 
-WIDTHS = np.geomspace(0.25, 4.0, 13)
-"""Standard deviations, in bins, of the Gaussian pulses that are tried."""
+WIDTHS = np.geomspace(0.1, 4.0, 17)
+"""Standard deviations, in bins, of the Gaussian pulses that are tried; of narrower ones all returns but those at the border of a bin look
+alike."""
 WIDTH_PIXELS = 512
 """Number of brightest pixels that decide on the width."""
 WIDTH_WINDOW = 8
@@ -24,14 +25,16 @@ TAIL_PIXELS = 128
 """Number of brightest pixels that decide on the tail."""
 TAIL_PARTS, TAIL_TIMES = (0.2, 0.5, 1.0), (1.0, 2.5, 6.0)
 """Tails that are tried first: parts of the photons, and decay times in standard deviations of the best Gaussian, whose width then shrinks
-to CORE of it."""
-CORE = 0.75
+to CORE of it, and the shortest decay time, in bins, that histograms tell."""
+CORE, SHORTEST_TAIL = 0.75, 0.25
+FLAT_BINS, FLAT_EDGES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), (0.05, 0.2)
+"""Flat tops that are tried first: lengths in bins, and standard deviations of their edges as a part of these."""
 TAIL_GAIN = 12.0
-"""Log likelihood that a tail must add: two more numbers fitted to a thousand photons or so deserve 7 (Schwarz 1978)."""
+"""Log likelihood that a tail or a flat top must add: two more numbers fitted to a thousand photons or so deserve 7 (Schwarz 1978)."""
 TAIL_SPAN = 0.5
 """Longest pulse with a tail, as a part of the histogram: what is longer cannot be told from background."""
-TAIL_ROUNDS, TAIL_STEP = 7, 1.35
-"""Rounds of the search that multiplies or divides width, decay time and part, and its first factor, whose root the next round takes."""
+ROUNDS, STEP = 7, 1.35
+"""Rounds of the search that multiplies or divides each number of a pulse, and its first factor, whose root the next round takes."""
 
 LEAST_SIGMA = 1e-6
 """Least standard deviation of a return's time that enters the cost, in bins: float32 resolves no smaller one."""
@@ -44,11 +47,18 @@ class PulseShape(NamedTuple):
     sigma: float  # bins: of the Gaussian
     tail: float  # bins: decay time of the delayed photons, 0 without a tail
     part: float  # of the photons that are delayed
+    flat: float = 0.0  # bins: for how long the light is on, 0 for a mere peak
+
+
+class _Tried(NamedTuple):
+    evidence: float
+    numbers: tuple[float, ...]
+    shape: PulseShape
 
 
 def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
-    """Return the pulse under which the brightest histograms are likeliest: Gaussian, or with an exponential tail where that explains them
-    better; waits for the device.
+    """Return the pulse under which the brightest histograms are likeliest: Gaussian, or with an exponential tail or a flat top where that
+    explains them better; waits for the device.
 
     Args:
         counts: [pixel, bin] the same as recorded, to pick the brightest.
@@ -75,7 +85,8 @@ def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
         place = 0.5 * (before - after) / (before - 2 * here + after)  # of the parabola through the three
     sigma = float(WIDTHS[best] * (WIDTHS[1] / WIDTHS[0]) ** place)
     few = histograms.of(chosen[:TAIL_PIXELS])
-    return _tailed(lambda pulse: _evidence(few, pulse), sigma, longest=TAIL_SPAN * counts.shape[1])
+    return _shaped(lambda pulse: _evidence(some, pulse), lambda pulse: _evidence(few, pulse), (float(WIDTHS[best]), sigma),
+                   longest=TAIL_SPAN * counts.shape[1])
 
 
 def brightest(counts: np.ndarray) -> np.ndarray:
@@ -94,26 +105,45 @@ def _evidence(some: LiveCounts, pulse: Pulse) -> float:
     return float(to_numpy(found.likelihood).sum(dtype=np.float64) - cost) if len(sigma) else -np.inf
 
 
-def _tailed(evidence: Callable[[Pulse], float], sigma: float, *, longest: float) -> PulseShape:
-    """Return the pulse with the best tail, or the Gaussian of `sigma` where no tail is worth it; `longest` in bins."""
-    plain = PulseShape(gaussian(sigma), sigma, 0.0, 0.0)
+def _shaped(of_many: Callable[[Pulse], float], of_few: Callable[[Pulse], float], sigmas: tuple[float, ...], *, longest: float
+            ) -> PulseShape:
+    """Return the likeliest pulse of Gaussians, by the evidence `of_many` pixels, and of those with a tail or a flat top, by that `of_few`;
+    `sigmas`, where Gaussians are sought, and `longest` in bins."""
 
-    def tried(core: float, tail: float, part: float) -> tuple[float, tuple[float, float, float]]:
-        pulse = with_tail(core, tail, min(part, 1.0))
-        return (evidence(pulse) if pulse.end - pulse.begin < longest else -np.inf), (core, tail, min(part, 1.0))
+    def peak(core: float) -> PulseShape:
+        core = max(core, WIDTHS[0])
+        return PulseShape(gaussian(core), core, 0.0, 0.0)
 
-    found, best = max((tried(CORE * sigma, ratio * sigma, part) for ratio, part in product(TAIL_TIMES, TAIL_PARTS)),
-                      key=lambda result: result[0])
-    least = evidence(plain.pulse) + TAIL_GAIN
-    if found < least:
-        return plain
-    factor = TAIL_STEP
-    for _ in range(TAIL_ROUNDS):
-        for index in range(3):
-            for change in (factor, 1 / factor):
-                value, numbers = tried(*(number * change if index == k else number for k, number in enumerate(best)))
-                if value > found:
-                    found, best = value, numbers
-                    break
-        factor = factor**0.5
-    return PulseShape(with_tail(*best), *best)
+    def tailed(core: float, tail: float, part: float) -> PulseShape:
+        core, tail, part = max(core, WIDTHS[0]), max(tail, SHORTEST_TAIL), min(part, 1.0)
+        return PulseShape(with_tail(core, tail, part), core, tail, part)
+
+    def flat_top(core: float, flat: float) -> PulseShape:
+        return PulseShape(flat_topped(core, flat), core, 0.0, 0.0, flat)
+
+    def valued(evidence: Callable[[Pulse], float], make: Callable[..., PulseShape], numbers: tuple[float, ...]) -> _Tried:
+        shape = make(*numbers)
+        return _Tried(evidence(shape.pulse) if shape.pulse.end - shape.pulse.begin < longest else -np.inf, numbers, shape)
+
+    def likeliest(evidence: Callable[[Pulse], float], make: Callable[..., PulseShape], starts: Iterable[tuple[float, ...]]) -> _Tried:
+        found = max((valued(evidence, make, start) for start in starts), key=lambda tried: tried.evidence)
+        factor = STEP
+        for _ in range(ROUNDS):
+            for index in range(len(found.numbers)):
+                for change in (factor, 1 / factor):
+                    numbers = (number * change if index == k else number for k, number in enumerate(found.numbers))
+                    tried = valued(evidence, make, tuple(numbers))
+                    if tried.evidence > found.evidence:
+                        found = tried
+                        break
+            factor = factor**0.5
+        return found
+
+    best = likeliest(of_many, peak, ((sigma,) for sigma in sigmas)).shape
+    most, sigma = of_few(best.pulse), best.sigma
+    for make, starts in ((tailed, [(CORE * sigma, ratio * sigma, part) for ratio, part in product(TAIL_TIMES, TAIL_PARTS)]),
+                         (flat_top, [(edge * flat, flat) for flat, edge in product(FLAT_BINS, FLAT_EDGES)])):
+        found = likeliest(of_few, make, starts)
+        if found.evidence > most + TAIL_GAIN:
+            most, best = found.evidence, found.shape
+    return best

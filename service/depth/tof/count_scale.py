@@ -57,11 +57,12 @@ def estimate_count_scale(counts: np.ndarray) -> CountScale:
     Source:
         Index of dispersion: Cox, Lewis, "The Statistical Analysis of Series of Events", 1966, section 6.3.
     """
-    single = _dispersion(counts)
-    step = _step(counts)
+    common = _step(counts)
+    single = _dispersion(counts, common)
+    step = 1.0 if common is None else common
     if single is None:
         return CountScale(step, False, False)
-    added = [single, *(_dispersion(_added(counts, bins)) or 0.0 for bins in COARSE if counts.shape[1] >= 4 * bins)]
+    added = [single, *(_dispersion(_added(counts, bins), common) or 0.0 for bins in COARSE if counts.shape[1] >= 4 * bins)]
     if single < POISSON[0] and max(added) > SHARED * single:
         return CountScale(_rounded(max(added), step), True, True)
     return CountScale(_rounded(single, step), False, True)
@@ -80,8 +81,8 @@ def _rounded(dispersion: float, step: float) -> float:
     return dispersion
 
 
-def _dispersion(counts: np.ndarray) -> float | None:
-    """Return variance over mean of the background; None where there is too little of it."""
+def _dispersion(counts: np.ndarray, step: float | None) -> float | None:
+    """Return variance over mean of the background; None where there is too little of it. `step`: of which all counts are multiples."""
     pairs = counts[: len(counts) // 2 * 2].reshape(-1, 2, counts.shape[1]).astype(np.float64)
     if len(pairs) == 0 or counts.shape[1] < 2:
         return None
@@ -89,7 +90,7 @@ def _dispersion(counts: np.ndarray) -> float | None:
     dark = _is_background(total)
     lone = total[dark & (total > 0)]
     if len(lone) >= STEP_VALUES and len(lone) < FEW * dark.sum():
-        return float(np.quantile(lone, 0.25))  # nearly every count is one photon
+        return step or float(np.quantile(lone, 0.25))  # nearly every count is one photon, but where it is of the foot of a pulse
     dark = dark[:, 1:] & dark[:, :-1]
     squared, mean = dark * (between[:, 1:] - between[:, :-1]) ** 2, dark * (total[:, 1:] + total[:, :-1])
     size = BLOCK_PAIRS[0]
@@ -115,11 +116,11 @@ def _is_background(total: np.ndarray) -> np.ndarray:
     return np.asarray(summed <= level + np.where(noise > 0, np.minimum(noise, height), height))
 
 
-def _step(counts: np.ndarray) -> float:
-    """Return the step of which all counts are multiples; 1 where there is none, or where it is below the smallest count."""
+def _step(counts: np.ndarray) -> float | None:
+    """Return the step of which all counts are multiples, the smallest count; None where there is none."""
     values = counts[counts > 0]
     if len(values) < STEP_VALUES:
-        return 1.0
+        return None
     step = float(values.min())
     multiples = values.astype(np.float64) / step
-    return step if np.abs(multiples - np.rint(multiples)).max() < STEP_TOLERANCE else 1.0
+    return step if np.abs(multiples - np.rint(multiples)).max() < STEP_TOLERANCE else None

@@ -17,7 +17,7 @@ from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
 from service.depth.base.solution import RangeImage
 from service.depth.tof.count_scale import CountScale, estimate_count_scale
 from service.depth.tof.inside_out import BINS, turned_inside_out
-from service.depth.tof.phase_checks import DOUBTED
+from service.depth.tof.phase_checks import DOUBTED, HISTOGRAM_REPEATS, beyond_span
 from service.depth.tof.shared_light import find_fog, pattern_bins, without_bins
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
@@ -74,6 +74,8 @@ def full_count(counts: np.ndarray) -> float | None:
     return top if (flat >= FLAT_TOPS or bits) and heaped > HEAPED * below else None
 
 
+NARROW, NARROW_DOUBT = 0.6, 1.4
+"""Width of a pulse, in bins, below which it shows only where a return lies at the border of a bin, and by what factor it is then off."""
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
 LEAST_CONFIDENCE = 0.95
@@ -147,7 +149,10 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         status = np.where(missing, int(Status.LOW_MODULATION), np.where(taken & (photons > 0), int(Status.OK), status))
         weak = int((taken & ~missing).sum())
     if pile_up is not None and pile_up.relative > 0:
-        sigma = np.hypot(sigma, _doubt(photons_of, pile_up, pulse, position, device))
+        more = max(math.ceil(pile_up.pulses * math.exp(pile_up.relative)), pile_up.pulses + 1)
+        sigma = np.hypot(sigma, _moved(correct_pileup(place(photons_of, device), pulses=more), pulse, position, pulse.width))
+    if source["from"] == "histograms" and pulse.width < NARROW:
+        sigma = np.hypot(sigma, _moved(histograms, pulse.stretched(NARROW_DOUBT), position, NARROW))
     if fog is not None:
         sigma = np.hypot(sigma, fog.shift(position, photons, pulse.width))
         outside = fog.stands_out(photons_of, to_numpy(found.background), position, pulse.width)
@@ -167,11 +172,13 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
                         "the scatter that this makes, not a shift that all of them share, as by fog")
     range_m = (start_m + position * bin_m).reshape(rows, cols)
     sure = (solved & usable & (confidence >= LEAST_CONFIDENCE)).reshape(rows, cols)
-    inside_out = turned_inside_out(range_m, start_m + end_m - range_m, photons.reshape(rows, cols), sure, rays, repeat_m=start_m + end_m,
-                                   reversal=BINS)
-    if inside_out is not None:
+    wrong = turned_inside_out(range_m, start_m + end_m - range_m, photons.reshape(rows, cols), sure, rays, repeat_m=start_m + end_m,
+                              reversal=BINS)
+    if wrong is None:
+        wrong = beyond_span(range_m, sure, nearest_m=start_m, repeat_m=end_m - start_m, why=HISTOGRAM_REPEATS)
+    if wrong is not None:
         confidence = confidence * DOUBTED
-        warnings.append(inside_out)
+        warnings.append(wrong)
     several = (to_numpy(found.photons) > 0).sum(axis=0)
     facts: dict[str, Any] = {
         "bins": frames.counts.shape[1],
@@ -251,12 +258,11 @@ def live_photons(frames: Histograms, photons: np.ndarray, calibration: TofCalibr
     return histograms, shape_of(histograms, shown), found
 
 
-def _doubt(photons: np.ndarray, pile_up: PulseCount, pulse: Pulse, position: np.ndarray, device: str) -> np.ndarray:
-    """Return by how many bins each position moves with the number of pulses, which was estimated, by a standard deviation."""
-    more = max(math.ceil(pile_up.pulses * math.exp(pile_up.relative)), pile_up.pulses + 1)
-    other = find_returns(correct_pileup(place(photons, device), pulses=more), pulse)
-    moved = np.abs(to_numpy(other.position)[0] - position)
-    return np.where(moved < pulse.width, moved, 0)
+def _moved(histograms: LiveCounts, pulse: Pulse, position: np.ndarray, most: float) -> np.ndarray:
+    """Return by how many bins each position moves where histograms or pulse are others, as likely ones; 0 where by `most` or more, to
+    another return."""
+    moved = np.abs(to_numpy(find_returns(histograms, pulse).position)[0] - position)
+    return np.where(moved < most, moved, 0)
 
 
 def _zero_of(shape: PulseShape, frames: Histograms, calibration: TofCalibration, warnings: list[str]
@@ -267,6 +273,8 @@ def _zero_of(shape: PulseShape, frames: Histograms, calibration: TofCalibration,
     if calibration.pulse_sigma_s is not None:
         return shape.pulse, {"from": "calibration", "sigma_s": calibration.pulse_sigma_s}, 0.0
     facts: dict[str, Any] = {"from": "histograms", "sigma_s": float(f"{shape.sigma * frames.bin_s:.4g}")}
+    if shape.flat:
+        facts |= {"flat_s": float(f"{shape.flat * frames.bin_s:.4g}")}
     if shape.part == 0:
         return shape.pulse, facts, 0.0
     facts |= {"tail_s": float(f"{shape.tail * frames.bin_s:.4g}"), "tail_part": float(f"{shape.part:.3g}")}

@@ -55,6 +55,11 @@ most."""
 END_PART, FEWEST_WRAPPED, WRAPPED_SHARE = 0.03, 20, 1e-4
 """Largest distance of neighbours over an end of the span, as a part of it, and number of such neighbours and their share of the pixels,
 from which on a surface runs on behind the span."""
+PHASES_REPEAT = "modulation_hz", ("all phases repeat: they are farther than the frequencies tell apart; give --near-m, or add a "
+                                  "frequency")
+HISTOGRAM_REPEATS = "bin_s", ("the histogram begins again: they are farther than a period of the laser reaches; let it pulse more "
+                              "seldom, or turn the bins so that the nearest surface comes first, with their tof.start_s")
+"""What repeats, and what to do, as `beyond_span` says it."""
 FULL, HEAPED = 20, 5.0
 """Number of readings of each of two images that are the largest of all, and how many times as many they must be as are of each level of the
 tenth below, from which on a camera was full there: noise gives the largest to one, and an even wall to one image."""
@@ -258,13 +263,15 @@ def unfitting_share(part: float) -> str | None:
         "image were lost, or something moved between two: these are unsure")
 
 
-def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float) -> str | None:
+def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float, why: tuple[str, str] = PHASES_REPEAT
+                ) -> str | None:
     """Return that surfaces run on behind the farthest range and so appear before the nearest, as a sentence; None if none does.
 
     Args:
         range_m: [rows, cols] metres, searched over all of the span.
         sure: [rows, cols] bool, pixels with a range.
-        nearest_m, repeat_m: the least range, and the distance after which all phases repeat.
+        nearest_m, repeat_m: the least range, and the distance after which all phases repeat, or the histogram does.
+        why: the field of the manifest, and what repeats there with what to do.
     """
     part = (range_m - nearest_m) / repeat_m
     wrapped = 0
@@ -274,5 +281,5 @@ def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repe
         wrapped += int((both & (np.abs(1 - step) < END_PART)).sum())
     if wrapped < max(FEWEST_WRAPPED, WRAPPED_SHARE * sure.sum()):
         return None
-    return (f"frames[].tof.modulation_hz: surfaces run on from {nearest_m + repeat_m:.2f} m to {nearest_m:.2f} m, where all phases repeat: "
-            "they are farther than the frequencies tell apart; give --near-m, or add a frequency; no range is believed")
+    return (f"frames[].tof.{why[0]}: surfaces run on from {nearest_m + repeat_m:.2f} m to {nearest_m:.2f} m, where {why[1]}; no range is "
+            "believed")

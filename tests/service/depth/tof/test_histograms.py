@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
+from service.depth.tof.count_scale import estimate_count_scale
 from service.depth.tof.histograms import full_count
 from tests.reference import tof
 from tests.scenes.depth import depth_of
@@ -205,3 +206,41 @@ def test_a_bin_that_the_timer_fills_in_every_pixel_is_no_surface(tmp_path):
     assert any("same pulse" in sentence for sentence in result.warnings)
     is_calibrated(ratios(result))
     assert result.maps.mask.mean() > 0.9
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("sigma_s", "photons"), [(0.15e-9, 1000), (0.3e-9, 20000)])
+def test_a_pulse_much_narrower_than_a_bin_is_no_tail(sigma_s, photons, tmp_path):
+    """It shows only where a return lies at the border of a bin: 23 % of the ranges were beyond 5 σ."""
+    result = solve(tmp_path / "c", tof.histogram(VIEW, photons, background=0.5, sigma_s=sigma_s, seed=2))
+    assert result.warnings == ()
+    part = ratios(result)
+    assert 1.4826 * np.median(part) < 1.4 and np.mean(part > 5) < 0.01
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("length_s", [1.5e-9, 4e-9])
+def test_a_pulse_with_a_flat_top_is_one_return_at_its_middle(length_s, tmp_path):
+    """As of a laser that is on for some nanoseconds; two peaks explained it, the stronger one half a pulse aside (26 % beyond 5 σ)."""
+    mean = np.zeros((ROWS, COLS, 64))
+    shifts = tof.LIGHT / 2 * length_s * (np.arange(40) / 40 - 0.4875)
+    for shift in shifts:
+        moved = VIEW.distance + shift
+        mean += tof.histogram(VIEW._replace(distance=moved, albedo=VIEW.albedo * (moved / VIEW.distance) ** 2), 4000, sigma_s=0.1e-9) / 40
+    result = solve(tmp_path / "c", np.random.default_rng(1).poisson(mean))
+    is_calibrated(ratios(result))
+    assert json.loads(result.report_path.read_text())["found"]["pulse"]["flat_s"] == pytest.approx(length_s, rel=0.1)
+
+
+@pytest.mark.long
+def test_surfaces_beyond_the_period_of_the_laser_are_said(tmp_path):
+    """A wall to 11.6 m under a period of 9 m: a fifth of it lies 9 m too near, at confidence 1 otherwise."""
+    counts = tof.histogram(tof.room(48, 64), 4000, background=0.05, bins=80, seed=3)
+    result = solve(tmp_path / "c", counts[..., :40] + counts[..., 40:])
+    assert any("where the histogram begins again" in sentence for sentence in result.warnings) and not result.maps.mask.any()
+
+
+def test_the_feet_of_pulses_in_the_dark_are_photons():
+    """Without background lone counts are of pulses, of few and of many photons: 57 units were said to be one."""
+    counts = tof.histogram(VIEW, 50000, background=0, sigma_s=0.3e-9, seed=2).reshape(-1, 64)
+    assert estimate_count_scale(counts).units == 1 and estimate_count_scale(7 * counts).units == 7
