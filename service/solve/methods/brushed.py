@@ -15,6 +15,8 @@ from service.reporting.progress import Timings
 from service.solve.base.solution import Solution, half
 from service.solve.methods.kinds import READ_AT_ONCE, Read
 
+FEWEST_LIGHTS = 12
+"""Fewest lights under which streaks are looked for: a pixel has seven unknowns, and fewer lights were not tried."""
 UNEXPLAINED = 0.5
 """Least residual of pixels that may be brushed: 45 path-traced things leave at most 0.33 in the median, brushed ones 0.58 to 0.98."""
 SURE, SAVED = 0.1, 0.5
@@ -51,17 +53,13 @@ def place_brushed(solution: Solution, solvable: np.ndarray, shape: tuple[int, ..
     least = max(LEAST_SHARE * (np.stack(np.divmod(solvable, shape[1])) % FIRST == 0).all(axis=0).sum(), LEAST_PIXELS)
     if len(lattices[0]) < least:
         return np.zeros(0, int)
-    timings.stage("brushed", sum(map(len, lattices)))
+    count = sum(map(len, lattices))
+    timings.stage("brushed", count)
     fits = _Fits(solution, tried, read, timings, lobe)
-    fits.begin(lattices[0], first_starts()[:, None])
-    brushed = fits.below(SURE)
-    if len(brushed) < least:
-        return np.zeros(0, int)
-    for step, here in zip(THEN, lattices[1:], strict=True):
-        away, nearest = cKDTree(place[brushed]).query(place[here], k=range(1, min(NEAREST, len(brushed)) + 1))
-        near = away[:, 0] <= REACH * step
-        fits.begin(here[near], np.moveaxis(fits.streaks.starts[brushed[nearest[near]]], 1, 0))
-        brushed = fits.below(SAVED)
+    brushed = _found(fits, place, lattices, least)
+    timings.advance(count)  # those far from all others, or all where none is brushed, need no fit
+    if len(brushed) == 0:
+        return brushed
     _replace(solution, tried[brushed], Brushed(*(plane[brushed] for plane in fits.streaks)))
     solution.warnings.append(f"method svbrdf: {len(brushed) / len(solvable):.0%} of the pixels are brushed, with streaks for highlights: "
                              "normals follow from the streaks, but the roughness of the maps is that of a round highlight between their "
@@ -101,6 +99,20 @@ class _Fits:
         starts[0, :, 6:] = np.sqrt(found.widths.prod(axis=1, keepdims=True))
         starts[1, :, :3], starts[1, :, 6:] = self._solution.normal[:, pixels].T, self._solution.roughness[pixels, None] ** 2
         return fit_brushed(samples, starts, shape=self._lobe, round_lobe=True).cost
+
+
+def _found(fits: _Fits, place: np.ndarray, lattices: list[np.ndarray], least: float) -> np.ndarray:
+    """Return which of the tried pixels, at these rows and columns [m, 2], are brushed; none unless `least` of the first lattice are."""
+    fits.begin(lattices[0], first_starts()[:, None])
+    brushed = fits.below(SURE)
+    if len(brushed) < least:
+        return brushed[:0]
+    for step, here in zip(THEN, lattices[1:], strict=True):
+        away, nearest = cKDTree(place[brushed]).query(place[here], k=range(1, min(NEAREST, len(brushed)) + 1))
+        near = away[:, 0] <= REACH * step
+        fits.begin(here[near], np.moveaxis(fits.streaks.starts[brushed[nearest[near]]], 1, 0))
+        brushed = fits.below(SAVED)
+    return brushed
 
 
 def _replace(solution: Solution, pixels: np.ndarray, found: Brushed) -> None:

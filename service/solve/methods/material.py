@@ -40,7 +40,7 @@ from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.interreflection import ArrivingLight
 from service.solve.height.part_scene import Material
 from service.solve.methods.blurred import place_blurred_metals
-from service.solve.methods.brushed import place_brushed
+from service.solve.methods.brushed import FEWEST_LIGHTS, place_brushed
 from service.solve.methods.diffuse import APART, pair_starts
 from service.solve.methods.kinds import LOBE_PIXELS, Kind, Kinds, lobe_report
 from service.solve.methods.material_options import WHOLE_SOLVER, MaterialOptions
@@ -144,8 +144,7 @@ class _Walk:
             start = pair_starts(self._solved, LOBE_PIXELS)
             pixels = np.concatenate([start, start + APART]) if len(start) else np.tile(self._spread, 2)
             support = support_of(self.result, self._read(pixels, light), self.result.normal[:, pixels].T, matt=self._matt)
-            self._supported, self._pull, self._simpler = support.lobes, support.pull, support.simpler
-            self._unsupported = support.warning
+            self._supported, self._simpler, self._pull, self._unsupported = support
             self._simple = self._robust if support.simpler is Method.ROBUST else self._simple
         if self._supported:
             self._shape_of(self._spread, light)
@@ -290,7 +289,7 @@ class _Walk:
         if self._given.stack.light_count >= LEAST_LIGHTS:
             blurred = place_blurred_metals(result, misread, shape, read)
             abundance[blurred], own[:, blurred], tilt[:, blurred] = 0, 0, 0
-        if not self._matt:
+        if not self._matt and self._given.stack.light_count >= FEWEST_LIGHTS:
             abundance[place_brushed(result, self._solvable, shape, self._pick, self._given.timings, lobe=self._lobe)] = 0
         if self._unsupported and not result.mostly_brushed:
             result.warnings.append(self._unsupported)
