@@ -46,6 +46,7 @@ LEAST_FREE = 0.1
 Lobe = wp.types.vector(length=START, dtype=wp.float32)
 Square = wp.types.matrix(shape=(UNKNOWNS, UNKNOWNS), dtype=wp.float32)
 Column = wp.types.vector(length=UNKNOWNS, dtype=wp.float32)
+Sums = wp.types.vector(length=5, dtype=wp.float32)
 
 
 @wp.struct
@@ -115,17 +116,30 @@ def light_at(readings: Readings, light: int, i: int) -> wp.vec3:
 
 
 @wp.func
+def one_over_noise(y: float, level: float, criteria: Criteria) -> float:
+    """Return 1 / σ of a reading."""
+    return 1.0 / (criteria.noise[0] * level + criteria.noise[1] * wp.max(y, 0.0))
+
+
+@wp.func
 def weight_of(y: float, predicted: float, level: float, criteria: Criteria):
     """Return the weight of a reading in a robust fit, and the exponential of its cost."""
-    sigma = 1.0 / (criteria.noise[0] * level + criteria.noise[1] * wp.max(y, 0.0))
+    sigma = one_over_noise(y, level, criteria)
     off = (y - predicted) * sigma
     w, factor = weigh_grey(y, predicted, off * off, wp.where(y < 0.0, 0.0, 1.0), sigma, criteria.shadow)
     return w, factor
 
 
 @wp.func
-def two_unknowns(dd: float, ds: float, ss: float, rd: float, rs: float):
+def products(w: float, fd: float, fs: float, left: float) -> Sums:
+    """Return what a reading of weight w adds to the normal equations of albedo and F0; `left` is what both explain together."""
+    return Sums(w * fd * fd, w * fd * fs, w * fs * fs, w * fd * left, w * fs * left)
+
+
+@wp.func
+def two_unknowns(sums: Sums):
     """Return the albedo, 0 or more, and the F0, 0 to 1, of normal equations."""
+    dd, ds, ss, rd, rs = sums[0], sums[1], sums[2], sums[3], sums[4]
     d_on, s_on = active(dd, ds, ss, rd, rs)
     inverse = d_on / wp.max(dd, 1.0e-20)
     shine = wp.clamp(s_on * (rs - inverse * ds * rd) / wp.max(ss - inverse * ds * ds, 1.0e-20), 0.0, 1.0)
@@ -136,21 +150,17 @@ def two_unknowns(dd: float, ds: float, ss: float, rd: float, rs: float):
 def plain_fit(readings: Readings, i: int, lobe: Lobe, criteria: Criteria):
     """Return albedo and F0 of a lobe by least squares with weights of the noise alone, and the weighted squares that are left."""
     v, level = wp.vec3(readings.view[0, i], readings.view[1, i], readings.view[2, i]), readings.level[i]
-    dd, ds, ss, rd, rs, yy = float(0.0), float(0.0), float(0.0), float(0.0), float(0.0), float(0.0)
+    sums, yy = Sums(), float(0.0)
     for light in range(readings.grey.shape[0]):
         y = readings.grey[light, i]
         fd, fs, fixed = responses(lobe, light_at(readings, light, i), v, criteria.form)
-        sigma = wp.where(y < 0.0, 0.0, 1.0 / (criteria.noise[0] * level + criteria.noise[1] * wp.max(y, 0.0)))
+        sigma = wp.where(y < 0.0, 0.0, one_over_noise(y, level, criteria))
         w = sigma * sigma
         left = y - fixed
-        dd += w * fd * fd
-        ds += w * fd * fs
-        ss += w * fs * fs
-        rd += w * fd * left
-        rs += w * fs * left
+        sums += products(w, fd, fs, left)
         yy += w * left * left
-    rho, f0 = two_unknowns(dd, ds, ss, rd, rs)
-    return rho, f0, yy - rho * (2.0 * rd - rho * dd - 2.0 * f0 * ds) - f0 * (2.0 * rs - f0 * ss)
+    rho, f0 = two_unknowns(sums)
+    return rho, f0, yy - rho * (2.0 * sums[3] - rho * sums[0] - 2.0 * f0 * sums[1]) - f0 * (2.0 * sums[4] - f0 * sums[2])
 
 
 @wp.func
@@ -160,20 +170,15 @@ def robust_fit(readings: Readings, i: int, lobe: Lobe, first_rho: float, first_f
     rho, f0, cost = float(first_rho), float(first_f0), float(0.0)
     for turn in range(3):
         cost = float(0.0)
-        dd, ds, ss, rd, rs = float(0.0), float(0.0), float(0.0), float(0.0), float(0.0)
+        sums = Sums()
         for light in range(readings.grey.shape[0]):
             y = readings.grey[light, i]
             fd, fs, fixed = responses(lobe, light_at(readings, light, i), v, criteria.form)
             w, factor = weight_of(y, rho * fd + f0 * fs + fixed, level, criteria)
-            left = y - fixed
             cost += log_of(factor)
-            dd += w * fd * fd
-            ds += w * fd * fs
-            ss += w * fs * fs
-            rd += w * fd * left
-            rs += w * fs * left
+            sums += products(w, fd, fs, y - fixed)
         if turn < 2:
-            rho, f0 = two_unknowns(dd, ds, ss, rd, rs)
+            rho, f0 = two_unknowns(sums)
     return rho, f0, cost
 
 
@@ -329,18 +334,13 @@ def brushed_kernel() -> Any:
         fitted[START + 7, i] = normal_variance
         fitted[START + 8, i] = albedo_variance
         for c in range(3):
-            dd, ds, ss, rd, rs = float(0.0), float(0.0), float(0.0), float(0.0), float(0.0)
+            sums = Sums()
             for light in range(readings.grey.shape[0]):
                 y = readings.grey[light, i]
                 fd, fs, fixed = responses(best, light_at(readings, light, i), v, criteria.form)
                 w, _factor = weight_of(y, best_rho * fd + best_f0 * fs + fixed, readings.level[i], criteria)
-                left = readings.colour[c, light, i] - fixed
-                dd += w * fd * fd
-                ds += w * fd * fs
-                ss += w * fs * fs
-                rd += w * fd * left
-                rs += w * fs * left
-            rho_c, f0_c = two_unknowns(dd, ds, ss, rd, rs)
+                sums += products(w, fd, fs, readings.colour[c, light, i] - fixed)
+            rho_c, f0_c = two_unknowns(sums)
             fitted[START + 1 + c, i] = rho_c
             fitted[START + 4 + c, i] = f0_c
 

@@ -34,8 +34,8 @@ def starts_about(normal, off_degrees, widths=(0.3, 0.12)):
 
 @pytest.mark.parametrize(("widths", "albedo"), [((0.35, 0.1), (0, 0, 0)), ((0.25, 0.12), COLOUR)])
 def test_normal_tangent_widths_and_material_of_a_streak(device, widths, albedo):
-    """Of 40 lights, from normals 3 degrees off. Readings are half floats, 2^-11 of each: normals are within a thousandth of a radian, the
-    other unknowns within five such steps; a tangent has no sign."""
+    """The fit begins from normals 3 degrees off, under 40 lights. Half floats round readings to 2^-11 of each, which leaves normals within
+    a thousandth of a radian and the other unknowns within five times as much. A tangent has no sign."""
     lights = sphere_directions(40)
     samples, _ = sample(brushed(lights, widths, albedo), device, lights=lights)
     found = fit_brushed(samples, starts_about(NORMAL, 3.0), shape=LobeShape())
@@ -49,8 +49,8 @@ def test_normal_tangent_widths_and_material_of_a_streak(device, widths, albedo):
 
 
 def test_the_error_holds_noise(device):
-    """Noise of 5 % of each reading under 40 lights: the angle of two tilts is 0.83 of their deviation in the median, and 2.1 at the 90th
-    percentile; by 120 pixels within a fifth, the second up to half more for those at which the fit stops early."""
+    """Noise is 5 % of each reading, under 40 lights. Of two Gaussian tilts the angle is 0.83 of σ in the median, which 120 pixels tell
+    within a fifth, and 1.5 at the 90th percentile. The second may be twice that, as few bright readings tell σ and some fits stop early."""
     lights = sphere_directions(40)
     radiance = brushed(lights, (0.35, 0.15))
     radiance *= 1 + 0.05 * np.random.default_rng(5).normal(size=radiance.shape[1:])
