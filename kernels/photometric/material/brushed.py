@@ -79,7 +79,7 @@ def fit_brushed(samples: Samples, starts: np.ndarray, *, shape: LobeShape, round
     level = np.maximum(to_host(samples, samples.level), LEAST_LEVEL * grey.max(axis=1))
     readings.grey, readings.level, readings.view = put(grey.T), put(level), put(to_host(samples, samples.view).T)
     fitted = wp.empty((START + 9, count), dtype=wp.float32, device=device)
-    devices.launch(brushed_kernel(), count,
+    devices.launch(brushed_kernel, count,
                    [readings, put(np.moveaxis(starts, 1, 2)), criteria(None, shape), int(round_lobe)], [fitted], device=device, uneven=True)
     values = to_numpy(fitted).T
     tilt, albedo = np.sqrt(np.maximum(values[:, START + 7:], 0)).T

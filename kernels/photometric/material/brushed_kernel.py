@@ -8,11 +8,8 @@ Sources: Heitz, "Understanding the masking-shadowing function in microfacet-base
 heteroskedasticity-consistent covariance matrix estimators", Journal of Econometrics 1985 (HC3): a streak is told by few, bright readings.
 """
 
-from typing import Any
-
 import warp as wp
 
-from kernels.device import once
 from kernels.elementary import log_of
 from kernels.microfacet import INVERSE_PI, diffuse, schlick
 from kernels.photometric.model.candidates import LEAST_NZ
@@ -265,83 +262,78 @@ def given_start(starts: wp.array3d(dtype=float), start: int, i: int) -> Lobe:
     return lobe
 
 
-@once
-def brushed_kernel() -> Any:
-    """Return the kernel; a thread chooses two of the starts of its pixel, follows both, and writes the better end."""
-
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
-    def fit_streaks(first: int,
-                    readings: Readings,
-                    starts: wp.array3d(dtype=float),  # [S, START, 1 or n]
-                    criteria: Criteria,
-                    round_lobe: int,
-                    # outputs
-                    fitted: wp.array2d(dtype=float)):  # [17, n] lobe, cost, albedo, F0, variance of the normal and of the albedo
-        i = first + wp.tid()
-        v = wp.vec3(readings.view[0, i], readings.view[1, i], readings.view[2, i])
-        one, other = Lobe(), Lobe()
-        one_cost, other_cost = float(1.0e30), float(1.0e30)
-        for s in range(starts.shape[0]):
-            start = changed(given_start(starts, s, i), Column(), v)
-            _rho, _f0, cost = plain_fit(readings, i, start, criteria)
-            near = start[0] * one[0] + start[1] * one[1] + start[2] * one[2] > APART
-            if cost < one_cost:
-                if not near:
-                    other = one
-                    other_cost = one_cost
-                one = start
-                one_cost = cost
-            elif cost < other_cost and not near:
-                other = start
-                other_cost = cost
-        best, best_rho, best_f0, best_cost = Lobe(), float(0.0), float(0.0), float(1.0e30)
-        for follow in range(2):
-            if follow == 0 or other_cost < 1.0e30:
-                here = wp.where(follow == 0, one, other)
-                rho, f0, _left = plain_fit(readings, i, here, criteria)
-                rho, f0, cost = robust_fit(readings, i, here, rho, f0, criteria)
-                square, right = normal_equations(readings, i, here, rho, f0, criteria, round_lobe)
-                damping = float(DAMPING)
-                for _step in range(STEPS):
-                    damped = square
-                    for row in range(UNKNOWNS):
-                        damped[row, row] = square[row, row] * (1.0 + damping)
-                    step = solved(damped, right)
-                    for u in range(CURVED):
-                        longest = wp.where(u < 2, LONGEST_TILT, LONGEST_CHANGE)
-                        step[u] = wp.clamp(step[u], -longest, longest)
-                    if round_lobe == 1:
-                        step[3] = step[2]
-                    there = changed(here, step, v)
-                    new_rho, new_f0, new_cost = robust_fit(readings, i, there, rho, f0, criteria)
-                    damping = damping * DAMPING_UP
-                    if new_cost < cost:
-                        here = there
-                        rho = new_rho
-                        f0 = new_f0
-                        cost = new_cost
-                        damping = wp.max(damping * wp.static(DAMPING_DOWN / DAMPING_UP), 1.0e-6)
-                        square, right = normal_equations(readings, i, here, rho, f0, criteria, round_lobe)
-                if cost < best_cost:
-                    best = here
-                    best_rho = rho
-                    best_f0 = f0
-                    best_cost = cost
-        for k in range(START):
-            fitted[k, i] = best[k]
-        fitted[START, i] = best_cost
-        normal_variance, albedo_variance = variances(readings, i, best, best_rho, best_f0, criteria, round_lobe)
-        fitted[START + 7, i] = normal_variance
-        fitted[START + 8, i] = albedo_variance
-        for c in range(3):
-            sums = Sums()
-            for light in range(readings.grey.shape[0]):
-                y = readings.grey[light, i]
-                fd, fs, fixed = responses(best, light_at(readings, light, i), v, criteria.form)
-                w, _factor = weight_of(y, best_rho * fd + best_f0 * fs + fixed, readings.level[i], criteria)
-                sums += products(w, fd, fs, readings.colour[c, light, i] - fixed)
-            rho_c, f0_c = two_unknowns(sums)
-            fitted[START + 1 + c, i] = rho_c
-            fitted[START + 4 + c, i] = f0_c
-
-    return fit_streaks
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+def brushed_kernel(first: int,
+                   readings: Readings,
+                   starts: wp.array3d(dtype=float),  # [S, START, 1 or n]
+                   criteria: Criteria,
+                   round_lobe: int,
+                   # outputs
+                   fitted: wp.array2d(dtype=float)):  # [17, n] lobe, cost, albedo, F0, variance of the normal and of the albedo
+    """Choose two of the starts of a pixel, follow both, and write the better end."""
+    i = first + wp.tid()
+    v = wp.vec3(readings.view[0, i], readings.view[1, i], readings.view[2, i])
+    one, other = Lobe(), Lobe()
+    one_cost, other_cost = float(1.0e30), float(1.0e30)
+    for s in range(starts.shape[0]):
+        start = changed(given_start(starts, s, i), Column(), v)
+        _rho, _f0, cost = plain_fit(readings, i, start, criteria)
+        near = start[0] * one[0] + start[1] * one[1] + start[2] * one[2] > APART
+        if cost < one_cost:
+            if not near:
+                other = one
+                other_cost = one_cost
+            one = start
+            one_cost = cost
+        elif cost < other_cost and not near:
+            other = start
+            other_cost = cost
+    best, best_rho, best_f0, best_cost = Lobe(), float(0.0), float(0.0), float(1.0e30)
+    for follow in range(2):
+        if follow == 0 or other_cost < 1.0e30:
+            here = wp.where(follow == 0, one, other)
+            rho, f0, _left = plain_fit(readings, i, here, criteria)
+            rho, f0, cost = robust_fit(readings, i, here, rho, f0, criteria)
+            square, right = normal_equations(readings, i, here, rho, f0, criteria, round_lobe)
+            damping = float(DAMPING)
+            for _step in range(STEPS):
+                damped = square
+                for row in range(UNKNOWNS):
+                    damped[row, row] = square[row, row] * (1.0 + damping)
+                step = solved(damped, right)
+                for u in range(CURVED):
+                    longest = wp.where(u < 2, LONGEST_TILT, LONGEST_CHANGE)
+                    step[u] = wp.clamp(step[u], -longest, longest)
+                if round_lobe == 1:
+                    step[3] = step[2]
+                there = changed(here, step, v)
+                new_rho, new_f0, new_cost = robust_fit(readings, i, there, rho, f0, criteria)
+                damping = damping * DAMPING_UP
+                if new_cost < cost:
+                    here = there
+                    rho = new_rho
+                    f0 = new_f0
+                    cost = new_cost
+                    damping = wp.max(damping * wp.static(DAMPING_DOWN / DAMPING_UP), 1.0e-6)
+                    square, right = normal_equations(readings, i, here, rho, f0, criteria, round_lobe)
+            if cost < best_cost:
+                best = here
+                best_rho = rho
+                best_f0 = f0
+                best_cost = cost
+    for k in range(START):
+        fitted[k, i] = best[k]
+    fitted[START, i] = best_cost
+    normal_variance, albedo_variance = variances(readings, i, best, best_rho, best_f0, criteria, round_lobe)
+    fitted[START + 7, i] = normal_variance
+    fitted[START + 8, i] = albedo_variance
+    for c in range(3):
+        sums = Sums()
+        for light in range(readings.grey.shape[0]):
+            y = readings.grey[light, i]
+            fd, fs, fixed = responses(best, light_at(readings, light, i), v, criteria.form)
+            w, _factor = weight_of(y, best_rho * fd + best_f0 * fs + fixed, readings.level[i], criteria)
+            sums += products(w, fd, fs, readings.colour[c, light, i] - fixed)
+        rho_c, f0_c = two_unknowns(sums)
+        fitted[START + 1 + c, i] = rho_c
+        fitted[START + 4 + c, i] = f0_c
