@@ -33,6 +33,8 @@ TAIL_GAIN = 12.0
 """Log likelihood that a tail or a flat top must add: two more numbers fitted to a thousand photons or so deserve 7 (Schwarz 1978)."""
 TAIL_SPAN = 0.5
 """Longest pulse with a tail, as a part of the histogram: what is longer cannot be told from background."""
+STRETCHES = np.geomspace(0.25, 4.0, 9)
+"""Factors, each √2 times the one before, by which the length of a declared pulse is tried."""
 ROUNDS, STEP = 7, 1.35
 """Rounds of the search that multiplies or divides each number of a pulse, and its first factor, whose root the next round takes."""
 
@@ -87,6 +89,19 @@ def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
     few = histograms.of(chosen[:TAIL_PIXELS])
     return _shaped(lambda pulse: _evidence(some, pulse), lambda pulse: _evidence(few, pulse), (float(WIDTHS[best]), sigma),
                    longest=TAIL_SPAN * counts.shape[1])
+
+
+def likeliest_stretch(histograms: LiveCounts, counts: np.ndarray, pulse: Pulse) -> float:
+    """Return by which of STRETCHES a pulse is to be stretched so that the brightest histograms are likeliest: 1 where they fit the pulse as
+    it is, or tell nothing; waits for the device.
+
+    Args:
+        counts: [pixel, bin] the same as recorded, to pick the brightest.
+    """
+    some = histograms.of(brightest(counts)[:WIDTH_PIXELS])
+    gains = np.array([_evidence(some, pulse.stretched(float(factor))) for factor in STRETCHES])
+    best = int(np.argmax(gains))
+    return float(STRETCHES[best]) if gains[best] > gains[len(gains) // 2] + TAIL_GAIN else 1.0
 
 
 def brightest(counts: np.ndarray) -> np.ndarray:

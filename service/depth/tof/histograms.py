@@ -10,7 +10,7 @@ from kernels.status import SOLVED, Status
 from kernels.tof.histogram.misfit import misfit
 from kernels.tof.histogram.pileup import LiveCounts, checked, correct_pileup, place, without_pileup
 from kernels.tof.histogram.pulse import Pulse, gaussian, measured
-from kernels.tof.histogram.pulse_width import PulseShape, estimate_pulse
+from kernels.tof.histogram.pulse_width import PulseShape, estimate_pulse, likeliest_stretch
 from kernels.tof.histogram.returns import Returns, find_returns
 from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
@@ -151,6 +151,13 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     if pile_up is not None and pile_up.relative > 0:
         more = max(math.ceil(pile_up.pulses * math.exp(pile_up.relative)), pile_up.pulses + 1)
         sigma = np.hypot(sigma, _moved(correct_pileup(place(photons_of, device), pulses=more), pulse, position, pulse.width))
+    stretch = likeliest_stretch(histograms, photons_of * usable[:, None], pulse) if source["from"] == "calibration" else 1.0
+    if stretch != 1:
+        longer = pulse.stretched(stretch)
+        sigma = np.hypot(sigma, _moved(histograms, longer, position, max(longer.width, NARROW)))
+        warnings.append(f"frames[].tof: the brightest returns are those of a pulse {stretch:.2g} times as long as that of "
+                        "--tof-calibration: measure it again, or leave it out, to have it estimated; the standard deviations hold by how "
+                        "much ranges would then differ")
     if source["from"] == "histograms" and pulse.width < NARROW:
         sigma = np.hypot(sigma, _moved(histograms, pulse.stretched(NARROW_DOUBT), position, NARROW))
     if fog is not None:
