@@ -21,6 +21,7 @@ from service.scans.duplicates import distinct
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, Sample, elsewhere, place_scans, reach_of, readings_of
 from service.scans.fusion.other_readings import LEAST_SCANS, Moved, common_scale, in_another_order, meant_otherwise
+from service.scans.fusion.pose_drift import pose_drift
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.fusion.shared_error import shared_sigma
@@ -107,7 +108,7 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
     scan_names = [summary.name for summary in summaries]
     warnings = [*placing_warnings(scan_names, placings, request.misplaced), *_pair_warnings(scan_names, elsewhere(samples, readings).pairs)]
-    words, poses = None, scans.poses()
+    words, poses, drift = None, scans.poses(), None
     doubtful = [number for number, placing in enumerate(placings) if placing.misplaced or placing.compared < LEAST_COMMON]
 
     def otherwise(at: list[Sample], moved: Moved) -> list[Readings]:
@@ -121,6 +122,11 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     elif poses is not None and any(placing.misplaced for placing in placings) and (
             order := in_another_order(samples, readings, poses, scan_names, doubtful, otherwise)):
         words = f"scans[].scan_to_world: {order}"
+    elif (drift := pose_drift(samples, readings)) is not None:
+        if drift.displacement_m > voxel / 2 or any(placing.misplaced for placing in placings):
+            words = drift.words(poses)
+        else:
+            warnings.append(f"{drift.words(poses)}; the standard deviations hold it")
     if words is not None:
         if request.misplaced is Misplaced.LEAVE_OUT:
             raise RequestError(f"{file}: {words}; --misplaced keep fuses them as they are")
@@ -150,6 +156,8 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
                         advance=timings.advance)
     shared = shared_sigma(samples, readings, used, float(np.median([summaries[number].pitch for number in used])))
+    if drift is not None:
+        shared = float(np.hypot(shared or 0.0, drift.displacement_m / np.sqrt(2)))  # each of two scans has its part
     if shared is None and len(used) > 1:
         warnings.append("the scans have too little in common to tell what each errs as a whole, by its pose or its calibration: σ of the "
                         "surface holds their noise alone")
