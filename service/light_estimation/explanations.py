@@ -1,7 +1,7 @@
 """Test whether another reading of the manifest explains the images much better than the manifest: encoding, brightness, order of lights.
 
 Every explanation is judged by the same robust Lambertian fit of the same pixels. On a right manifest no explanation is better by more
-than a factor of 1.9 (all objects of docs/methods.md but bare metal, for which no explanation is good: those must also leave little).
+than a factor of 1.9 (all objects of docs/checks.md but bare metal, for which no explanation is good: those must also leave little).
 The wrong manifests leave three to a hundred times more than the right explanation does.
 """
 

@@ -10,7 +10,7 @@ from stage.model import Fraction, Line, Positive
 
 SVBRDF_LIGHTS = 8
 """From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and what eight lights do not tell it is
-unsure, where robust is sure of normals that highlights and bounced light bend (docs/methods.md, Few lights)."""
+unsure, where robust is sure of normals that highlights and bounced light bend (docs/svbrdf.md, Few lights)."""
 
 MAX_SIGMA = 30.0
 """Largest standard error, in degrees, of a normal that counts as solved, unless the request says otherwise: a normal this far off says

@@ -1,4 +1,4 @@
-"""The cost of a candidate normal, vectorised over pixels in plain NumPy, from the description in docs/methods.md: a non-negative
+"""The cost of a candidate normal, vectorised over pixels in plain NumPy, from the description in docs/svbrdf.md: a non-negative
 mixture of lobes fitted by re-weighted coordinate descent, Cauchy cost, cast shadows at a fixed charge. Imports nothing of ours but the
 float64 reflectance model beside it."""
 

@@ -34,7 +34,7 @@ UNKNOWNS = 5
 """Unknowns of a pixel that its readings pay for: two of the normal, albedo, F0 and roughness."""
 ALIKE = 0.1
 """Standard deviation of the F0 of a dielectric that the object shares, as a part of it. This and the numbers below were chosen on thirteen
-path-traced objects; docs/methods.md has what they are worth on others."""
+path-traced objects; docs/svbrdf.md has what they are worth on others."""
 UNKNOWN_F0, METAL_F0 = 0.02, 0.5
 """Standard deviation of the F0 of a dielectric that no other pixel shares, half of the usual one, and of a metal: hardly any bound."""
 ROUGHNESS = 0.1

@@ -1,6 +1,6 @@
 """Other modes of the cost: candidates on wide rings, for pixels whose readings may mean another normal than the one found.
 
-A pixel whose readings are explained to little more than the noise of a camera, with readings to spare, has one mode (docs/methods.md says
+A pixel whose readings are explained to little more than the noise of a camera, with readings to spare, has one mode (docs/svbrdf.md says
 how many exceptions were found). The others are surveyed: candidates on rings about the normal found are judged as in `hypotheses`. The best
 of them is the start of another descent, and the costs of all say how probable other modes are (`certainty`). What the readings of a pixel
 say beyond the unknowns that they had to pay for is their evidence.

@@ -16,7 +16,7 @@ import numpy as np
 
 PITCH_DEGREES = 4.5
 """Angle between neighbouring directions. With it, broad light has half the error of 1024 samples of its own or less, on surfaces of any
-roughness (docs/methods.md)."""
+roughness (docs/relight_methods.md)."""
 LEAST_COLUMNS = 16
 """Least number of directions of a ring: with the four that its length asks for, they are too far apart in azimuth for a cubic."""
 

@@ -31,7 +31,7 @@ POOLED_ROWS = 64
 """Rows of an image that a thread pools at one time."""
 LEAST_ALPHA = 0.15
 """Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights. Between two of them the half vector moves by half
-of the angle: one light sees a lobe of a third of that in some pixels, and two in others (docs/methods.md)."""
+of the angle: one light sees a lobe of a third of that in some pixels, and two in others (docs/relight_methods.md)."""
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

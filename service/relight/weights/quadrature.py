@@ -33,7 +33,7 @@ from service.relight.weights.triangulation import share_smooth
 NEIGHBOURS = 6
 """Number of lights around one, as a triangular lattice has them."""
 RANGE = 2.0
-"""The range ρ in distances between neighbouring lights. The error of frames hardly depends on it from 1 to 3 (docs/methods.md)."""
+"""The range ρ in distances between neighbouring lights. The error of frames hardly depends on it from 1 to 3 (docs/relight_methods.md)."""
 SAMPLES = 2048
 """Most samples of a map: under an even sky they are 5° wide, and finer where the map is bright. The energies of 128 lights are within
 0.1 %, root mean square, of those of twenty times as many samples."""

@@ -72,7 +72,7 @@ def test_noise_alone_has_no_axes():
 
 
 def test_a_round_paraboloid_mirrored_is_a_saddle_which_fits_as_well():
-    """What docs/methods.md says cannot be seen."""
+    """What docs/checks.md says cannot be seen."""
     x, y = np.meshgrid(np.linspace(-1, 1, 60), -np.linspace(-1, 1, 60))
     bowl = np.stack([-x, -y, np.ones_like(x)]).reshape(3, -1)
     assert wrong_axes(at_sites(bowl, np.ones((60, 60), bool))) is None

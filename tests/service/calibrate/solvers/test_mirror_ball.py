@@ -187,4 +187,4 @@ def test_what_all_lights_share_is_left(count):
     known = least_error_degrees(count, table_degrees=5.0, strength=0.001)
     assert known == pytest.approx(5 * (3 / (2 * count)) ** 0.5, rel=0.02)
     assert least_error_degrees(count, table_degrees=5.0, strength=0.1) == pytest.approx(
-        {12: 2.66, 16: 2.31, 24: 1.88}[count], abs=0.03)  # the table of docs/methods.md
+        {12: 2.66, 16: 2.31, 24: 1.88}[count], abs=0.03)  # the table of docs/lights.md
