@@ -1,6 +1,6 @@
 """Photometric sampling against truth: balls of many materials under diffused sources, through files, as a user would solve them.
 
-`python -m benchmarks.sampling` prints the table of docs/figures.md; the images come from the float64 twin of the tests, which
+`python -m benchmarks.sampling` prints the table of docs/svbrdf.md; the images come from the float64 twin of the tests, which
 shares no code with the solver. Noise is Gaussian, a part of each reading.
 """
 
