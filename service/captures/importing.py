@@ -4,10 +4,10 @@ Uploaded files that are no capture get a proposal first: what they seem to be, a
 untrusted files: `service.captures.check_process` calls them in a process of its own.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service.reporting.progress import Progress, Timings
 from service.requests.base.base import Role
@@ -31,17 +31,17 @@ from service.requests.patterns import PatternAxis
 from stage.capture.capture import Capture
 from stage.capture.manifest import read_manifest, write_manifest
 from stage.errors import ManifestError, StageError
+from stage.importers import diligent, kinect, laser, lp, olat, patterns, relightlab, stereo, tof
+from stage.importers.camera_options import Selection, View
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
-from stage.importers.video import is_video
+from stage.importers.pattern_order import GrayStack, PhaseStack
+from stage.importers.patterns import PatternImages
+from stage.importers.raw_arrays import ArrayFiles
+from stage.importers.video import FrameRange, is_video, unpack
 from stage.stack.correction import Correction
 from stage.stack.peaks import MOST_FRAMES
 from stage.stack.readings import said_by_readings
-
-if TYPE_CHECKING:
-    from stage.importers.camera_options import Selection, View
-    from stage.importers.patterns import PatternImages
-    from stage.importers.raw_arrays import ArrayFiles
 
 
 def import_files(request: ImportRequest, progress: Progress | None = None, *, assumed: tuple[str, ...] = ()) -> Imported:
@@ -50,7 +50,7 @@ def import_files(request: ImportRequest, progress: Progress | None = None, *, as
     hold what the layout has, or do not fit the options."""
     timings = Timings(progress)
     timings.stage("import", 1)
-    imported = _IMPORTS[type(request)](request)
+    imported = _imported(request)
     manifest = read_manifest(imported.path)
     doubts, seen, faults = manifest.assumed, list[str](), list[tuple[str, str]]()
     timings.stage("readings", MOST_FRAMES)
@@ -69,122 +69,71 @@ def import_files(request: ImportRequest, progress: Progress | None = None, *, as
     return imported._replace(facts=(*imported.facts, *said, *faults))
 
 
-def _diligent(request: DiligentImport) -> Imported:
-    from stage.importers import diligent
-
-    return Imported(diligent.import_folder(request.source, request.folder), ())
-
-
-def _lp(request: LpImport) -> Imported:
-    from stage.importers import lp
-
-    return Imported(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space,
-                                     white=request.scale), ())
-
-
-def _opencv_gray(request: OpencvGrayImport) -> Imported:
-    from stage.importers.pattern_order import GrayStack
-    from stage.importers.patterns import PatternImages, import_gray
-
-    return import_gray(request.source, request.folder, gray=GrayStack(), pictures=PatternImages(
-        projector=request.projector, calibration=request.calibration, unit_m=request.unit_m))
-
-
-def _olat(request: OlatImport) -> Imported:
-    from stage.importers import olat
-
-    return olat.import_folder(
-        request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
-        variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
-        color_space=request.color_space, white=request.scale)
-
-
-def _photos(request: PhotosImport) -> Imported:
-    from stage.importers.olat import import_photos
-
-    return import_photos(request.source, request.folder, selection=_selection(request), view=_view(request),
-                         color_space=request.color_space)
-
-
-def _near_lights(request: NearLightsImport) -> Imported:
-    from stage.importers.olat import import_near_lights
-
-    return import_near_lights(
-        request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
-        selection=_selection(request), view=_view(request), color_space=request.color_space)
-
-
-def _relightlab(request: RelightlabImport) -> Imported:
-    from stage.importers import relightlab
-
-    return relightlab.import_folder(request.source, request.destination, color_space=request.color_space)
-
-
-def _gray(request: GrayImport) -> Imported:
-    from stage.importers.pattern_order import GrayStack
-    from stage.importers.patterns import import_gray
-
-    gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
-                     row_bits=request.row_bits)
-    pictures = _pattern_images(request)
-    return import_gray(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, gray=gray)
-
-
-def _phase(request: PhaseImport) -> Imported:
-    from stage.importers.pattern_order import GrayStack, PhaseStack
-    from stage.importers.patterns import import_phase
-
-    phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
-                       order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
-    gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
-    pictures = _pattern_images(request)
-    return import_phase(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, phase=phase,
-                        gray_images=request.gray_images, gray_stripe_px=request.gray_stripe, gray=gray,
-                        from_centre=request.origin is WaveOrigin.CENTRE)
+def _imported(request: ImportRequest) -> Imported:
+    """Write the capture.json of a request by the importer of its layout."""
+    match request:
+        case DiligentImport():
+            return Imported(diligent.import_folder(request.source, request.folder), ())
+        case LpImport():
+            return Imported(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space,
+                                             white=request.scale), ())
+        case RelightlabImport():
+            return relightlab.import_folder(request.source, request.destination, color_space=request.color_space)
+        case OlatImport():
+            return olat.import_folder(
+                request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
+                variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request),
+                view=_view(request), color_space=request.color_space, white=request.scale)
+        case PhotosImport():
+            return olat.import_photos(request.source, request.folder, selection=_selection(request), view=_view(request),
+                                      color_space=request.color_space)
+        case NearLightsImport():
+            return olat.import_near_lights(
+                request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
+                selection=_selection(request), view=_view(request), color_space=request.color_space)
+        case OpencvGrayImport():
+            return patterns.import_gray(request.source, request.folder, gray=GrayStack(), pictures=PatternImages(
+                projector=request.projector, calibration=request.calibration, unit_m=request.unit_m))
+        case GrayImport():
+            gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first,
+                             column_bits=request.column_bits, row_bits=request.row_bits)
+            source, pictures = _pattern_images(request)
+            return patterns.import_gray(source, request.folder, pictures=pictures, gray=gray)
+        case PhaseImport():
+            phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods,
+                               steps=request.steps, order=request.order, advancing=request.shift is PhaseShift.MINUS,
+                               offset_deg=request.offset_deg)
+            gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
+            source, pictures = _pattern_images(request)
+            return patterns.import_phase(source, request.folder, pictures=pictures, phase=phase, gray_images=request.gray_images,
+                                         gray_stripe_px=request.gray_stripe, gray=gray, from_centre=request.origin is WaveOrigin.CENTRE)
+        case ScannerImport():
+            return patterns.import_scanner(
+                request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
+                unit_m=request.unit_m, projector=request.projector, images=request.images)
+        case LaserImport():
+            return laser.import_folder(
+                request.source, request.folder, view=_view(request), camera=request.camera, planes=request.planes, form=request.form,
+                axes=request.axes, unit_m=request.unit_m, selection=_selection(request), color_space=request.color_space)
+        case TofImport():
+            return tof.import_correlations(
+                request.source, request.folder, frequencies_hz=request.frequencies_hz, phases_deg=request.phases_deg,
+                minus=request.signal is Signal.MINUS, order=request.order, arrays=_arrays(request), planes=request.planes,
+                source_m=request.source_m, view=_view(request))
+        case HistogramImport():
+            return tof.import_histograms(
+                request.source, request.folder, bin_s=request.bin_s, start_s=request.start_s, count_scale=request.count_scale,
+                pulses=request.pulses, first_photon_only=request.first_photon_only, bins=request.bins, arrays=_arrays(request),
+                source_m=request.source_m, view=_view(request))
+        case KinectImport():
+            return kinect.import_folder(request.source, request.folder, packet=request.packet, p0=request.p0, view=_view(request))
+        case StereoImport():
+            return stereo.import_pair(request.source, request.right, request.destination, calibration=request.calibration,
+                                      extrinsics=request.extrinsics, unit_m=request.unit_m, color_space=request.color_space)
+    raise TypeError(f"no importer takes a {type(request).__name__}")
 
 
-def _scanner(request: ScannerImport) -> Imported:
-    from stage.importers.patterns import import_scanner
-
-    return import_scanner(request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
-                          unit_m=request.unit_m, projector=request.projector, images=request.images)
-
-
-def _laser(request: LaserImport) -> Imported:
-    from stage.importers import laser
-
-    return laser.import_folder(request.source, request.folder, view=_view(request), camera=request.camera, planes=request.planes,
-                               form=request.form, axes=request.axes, unit_m=request.unit_m, selection=_selection(request),
-                               color_space=request.color_space)
-
-
-def _tof(request: TofImport) -> Imported:
-    from stage.importers.tof import import_correlations
-
-    return import_correlations(
-        request.source, request.folder, frequencies_hz=request.frequencies_hz, phases_deg=request.phases_deg,
-        minus=request.signal is Signal.MINUS, order=request.order, arrays=_arrays(request), planes=request.planes,
-        source_m=request.source_m, view=_view(request))
-
-
-def _histogram(request: HistogramImport) -> Imported:
-    from stage.importers.tof import import_histograms
-
-    return import_histograms(
-        request.source, request.folder, bin_s=request.bin_s, start_s=request.start_s, count_scale=request.count_scale,
-        pulses=request.pulses, first_photon_only=request.first_photon_only, bins=request.bins, arrays=_arrays(request),
-        source_m=request.source_m, view=_view(request))
-
-
-def _kinect(request: KinectImport) -> Imported:
-    from stage.importers import kinect
-
-    return kinect.import_folder(request.source, request.folder, packet=request.packet, p0=request.p0, view=_view(request))
-
-
-def _arrays(request: ArrayOptions) -> "ArrayFiles":
-    from stage.importers.raw_arrays import ArrayFiles
-
+def _arrays(request: ArrayOptions) -> ArrayFiles:
     return ArrayFiles(files=request.arrays, variables=request.variable, dtype=request.dtype, size=request.size)
 
 
@@ -192,48 +141,30 @@ def _axes(axis: PatternAxis) -> tuple[str, ...]:
     return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
 
 
-def _pattern_images(request: GrayImport | PhaseImport) -> "PatternImages":
-    """Return which images are frames; those of a video are unpacked first."""
-    from stage.importers.patterns import PatternImages
-    from stage.importers.video import FrameRange, unpack
-
-    video, space = None, request.color_space
+def _pattern_images(request: GrayImport | PhaseImport) -> tuple[Path, PatternImages]:
+    """Return the folder of images, and which of them are frames; those of a video are unpacked first."""
+    source, video, space = request.source, None, request.color_space
     if is_video(request.source):
         if request.destination is None:
             raise ManifestError(f"{request.source}: is a video: give a folder for its frames behind it")
         video = unpack(request.source, request.destination, FrameRange.parse(request.video_frames or "0"))
+        source = video.folder
         if "color_space" not in request.model_fields_set:
             space = "srgb_texture"  # videos are encoded for displays
     elif request.video_frames is not None:
         raise ManifestError(f"--video-frames {request.video_frames}: {request.source} is no video")
-    return PatternImages(projector=request.projector, images=request.images, mask=request.mask, white=request.white, black=request.black,
-                         calibration=request.calibration, unit_m=request.unit_m, color_space=space, video=video,
-                         exposures_s=request.exposures_s, patterns_first=request.exposure_order is ExposureOrder.PATTERN)
+    return source, PatternImages(
+        projector=request.projector, images=request.images, mask=request.mask, white=request.white, black=request.black,
+        calibration=request.calibration, unit_m=request.unit_m, color_space=space, video=video, exposures_s=request.exposures_s,
+        patterns_first=request.exposure_order is ExposureOrder.PATTERN)
 
 
-def _view(request: LensOptions) -> "View":
-    from stage.importers.camera_options import View
-
+def _view(request: LensOptions) -> View:
     return View(**{field.name: getattr(request, field.name) for field in fields(View) if hasattr(request, field.name)})
 
 
-def _selection(request: ImageOptions) -> "Selection":
-    from stage.importers.camera_options import Selection
-
+def _selection(request: ImageOptions) -> Selection:
     return Selection(images=request.images, mask=request.mask, ambient=request.ambient)
-
-
-def _stereo(request: StereoImport) -> Imported:
-    from stage.importers.stereo import import_pair
-
-    return import_pair(request.source, request.right, request.destination, calibration=request.calibration, extrinsics=request.extrinsics,
-                       unit_m=request.unit_m, color_space=request.color_space)
-
-
-_IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
-    DiligentImport: _diligent, LpImport: _lp, RelightlabImport: _relightlab, OlatImport: _olat, PhotosImport: _photos,
-    NearLightsImport: _near_lights, OpencvGrayImport: _opencv_gray, GrayImport: _gray, PhaseImport: _phase, ScannerImport: _scanner,
-    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser, StereoImport: _stereo}
 
 
 def propose(folder: Path) -> dict[str, Any]:
