@@ -16,9 +16,6 @@ import numpy as np
 
 from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
-from stage.files import replacing
-from stage.formats import images
-from stage.formats.images import write_png
 
 LIBRARY = "aravis-0.8"
 MOSAICS = {"RG": cv2.COLOR_BayerRGGB2RGB, "BG": cv2.COLOR_BayerBGGR2RGB, "GR": cv2.COLOR_BayerGRBG2RGB, "GB": cv2.COLOR_BayerGBRG2RGB}
@@ -90,10 +87,7 @@ class AravisCamera(Camera):
         """Take a picture, and write it with 16 bits, in which readings stay proportional to light."""
         pixels = self._frame(exposure_s)
         self._count += 1
-        path = self._setup.spool / f"frame_{self._count:06d}.png"
-        with replacing(path, flush=False) as temporary:
-            write_png(temporary, pixels, srgb=False)
-        return Picture(path, images.read_pixels(path))
+        return self._setup.written(self._count, pixels, srgb=False)
 
     def look(self) -> np.ndarray:
         """Return a picture, encoded for a screen."""
@@ -197,6 +191,4 @@ def _unref(thing: int) -> None:
 
 def open_camera(detail: str, setup: Setup) -> AravisCamera:
     """Return the camera of a name, such as that which `arv-tool-0.8` lists, or the first one."""
-    camera = AravisCamera(detail, setup)
-    setup.spool.mkdir(parents=True, exist_ok=True)
-    return camera
+    return AravisCamera(detail, setup)

@@ -10,6 +10,8 @@ import numpy as np
 
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
+from stage.files import replacing
+from stage.formats import images
 
 KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device", "aravis": "aravis_camera"}
 """The module of each kind of camera, KIND or KIND:DETAIL. A new one is a module with a function `open_camera(detail, setup)`, and an entry
@@ -52,6 +54,13 @@ class Setup(NamedTuple):
     def of(cls, request: AcquireRequest, known: frozenset[str] | None) -> Self:
         """Return what the options of a capture say."""
         return cls(request.out / SPOOL, request.timeout, tuple(shlex.split(request.trigger or "")), known, request.jpeg)
+
+    def written(self, number: int, pixels: np.ndarray, *, srgb: bool) -> Picture:
+        """Write pixels [rows, cols, 3] of a camera that has no files as one of the spool, and return them as they are read from it."""
+        path = self.spool / f"frame_{number:06d}.png"
+        with replacing(path, flush=False) as temporary:
+            images.write_png(temporary, pixels, srgb=srgb)
+        return Picture(path, images.read_pixels(path))
 
 
 class Camera(ABC):

@@ -203,6 +203,4 @@ def seconds_of(text: str) -> float | None:
 
 def open_camera(detail: str, setup: Setup) -> Gphoto2Camera:
     """Return the camera at a port such as usb:001,004, or the only one."""
-    camera = Gphoto2Camera(detail, setup)
-    setup.spool.mkdir(parents=True, exist_ok=True)
-    return camera
+    return Gphoto2Camera(detail, setup)

@@ -5,9 +5,6 @@ import numpy as np
 
 from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup
 from service.errors import RequestError
-from stage.files import replacing
-from stage.formats import images
-from stage.formats.images import write_png
 
 STALE_FRAMES = 4
 """The frames that a device keeps in its buffers, which were taken before the lamps changed."""
@@ -48,10 +45,7 @@ class VideoDevice(Camera):
         if not there or frame is None:
             raise NoPictureError("the video has no further frame")
         self._count += 1
-        path = self._setup.spool / f"frame_{self._count:06d}.png"
-        with replacing(path, flush=False) as temporary:
-            write_png(temporary, np.ascontiguousarray(frame[..., ::-1]), srgb=True)
-        return Picture(path, images.read_pixels(path))
+        return self._setup.written(self._count, np.ascontiguousarray(frame[..., ::-1]), srgb=True)
 
     def look(self) -> np.ndarray:
         """Return the next frame; a file begins again after its last one."""
@@ -82,6 +76,4 @@ def open_camera(detail: str, setup: Setup) -> VideoDevice:
     """Return the device of a number, or a video file."""
     if not detail:
         raise RequestError("--camera video: give the number of the device, as in video:0, or a file")
-    camera = VideoDevice(detail, setup)
-    setup.spool.mkdir(parents=True, exist_ok=True)
-    return camera
+    return VideoDevice(detail, setup)
