@@ -13,7 +13,7 @@ from service.acquisition.cameras.camera import Camera, NoPictureError, Setup, op
 from service.acquisition.capture_files import JOURNAL_FILE
 from service.acquisition.checks.judge import FULL_SCALE
 from service.acquisition.checks.motion import bands_of
-from service.acquisition.checks.picture_sample import TILE_PX, place_of_tile
+from service.acquisition.checks.picture_sample import TILE_PX, place_of_tile, stride
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import Shot, shots_of
@@ -187,7 +187,7 @@ class _Meter:
         if not self._space:
             self._space, self._place = self._request.color_space or color_space_of(picture.path), place_of_tile(picture.pixels)
         row, column = self._place
-        step = max(1, int(np.ceil(np.sqrt(picture.pixels[..., 0].size / MOST_PIXELS))))
+        step = stride(picture.pixels.shape, MOST_PIXELS)
         tile = linearise(picture.pixels[row:row + TILE_PX, column:column + TILE_PX].astype(np.float32), self._space).mean(axis=2)
         return _Taken(shot, np.ascontiguousarray(picture.pixels[::step, ::step], dtype=np.float32), tile)
 

@@ -16,6 +16,7 @@ from fastapi import Response as HttpResponse
 from fastapi.responses import FileResponse
 
 from service.acquisition.checks.judge import FULL_SCALE
+from service.acquisition.checks.picture_sample import stride
 from service.acquisition.plans.shots import Shot
 from service.calibrate.response import EVEN_LEVELS, MOST_PIXELS, Response, fit_response
 from service.depth.patterns.projection import stored
@@ -158,7 +159,7 @@ class PatternImages:
         usable, readings = [], []
         for path in pictures.values():
             recorded = images.read_pixels(path)
-            step = max(1, int(np.ceil(np.sqrt(recorded[..., 0].size / MOST_PIXELS))))
+            step = stride(recorded.shape, MOST_PIXELS)
             sparse = recorded[::step, ::step].astype(np.float32).reshape(-1, 3)
             usable.append((sparse < (self._request.saturation or FULL_SCALE)).all(axis=-1))
             readings.append(linearise(sparse, self._request.color_space or color_space_of(path)) @ np.array(GREY_WEIGHTS, np.float32))

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.acquisition.cameras.camera import Picture
 from service.acquisition.checks.judge import Judge
-from service.acquisition.checks.picture_sample import MOST_PIXELS
+from service.acquisition.checks.picture_sample import stride
 from service.acquisition.plans.shots import TRACKING, Shot
 from service.errors import RequestError
 from stage.colour.colour import linearise
@@ -98,7 +98,7 @@ def _by_hand(shot: Shot, rig: Rig) -> bool:
 
 def _light_factor(before: np.ndarray, after: np.ndarray, space: str, full_scale: float) -> float:
     """Return the light of a picture over that of another, where both have some and neither is clipped, if there are such pixels."""
-    step = max(1, int(np.ceil(np.sqrt(before.shape[0] * before.shape[1] / MOST_PIXELS))))
+    step = stride(before.shape)
     sparse = [np.ascontiguousarray(pixels[::step, ::step], dtype=np.float32) for pixels in (before, after)]
     whole = np.maximum(*(pixels.max(axis=2) for pixels in sparse)) < full_scale
     first, second = (linearise(pixels, space).mean(axis=2) for pixels in sparse)

@@ -32,14 +32,14 @@ class Sample(NamedTuple):
     """A digest of the readings; None: they hardly differ."""
 
 
-def _stride(shape: tuple[int, ...]) -> int:
-    """Return the distance in pixels between those that are read all over a picture."""
-    return max(1, int(np.ceil(np.sqrt(shape[0] * shape[1] / MOST_PIXELS))))
+def stride(shape: tuple[int, ...], most: int = MOST_PIXELS) -> int:
+    """Return the distance in pixels between those, `most` of them, that are read all over a picture of a shape."""
+    return max(1, int(np.ceil(np.sqrt(shape[0] * shape[1] / most))))
 
 
 def place_of_tile(pixels: np.ndarray) -> tuple[int, int]:
     """Return the first row and column of the tile: where a picture has most detail."""
-    step = _stride(pixels.shape)
+    step = stride(pixels.shape)
     small = pixels[::step, ::step].astype(np.float32).mean(axis=2)
     detail = np.zeros(small.shape)
     detail[1:, 1:] = np.abs(np.diff(small, axis=0))[:, 1:] + np.abs(np.diff(small, axis=1))[1:]
@@ -57,7 +57,7 @@ def sample_of(
     full_scale: float,  # the recorded value from which readings are clipped
 ) -> Sample:
     """Return the sample of a picture."""
-    step, (row, column) = _stride(pixels.shape), place
+    step, (row, column) = stride(pixels.shape), place
     sparse = np.ascontiguousarray(pixels[step // 2::step, step // 2::step], dtype=np.float32)
     tile = np.ascontiguousarray(pixels[row:row + TILE_PX, column:column + TILE_PX], dtype=np.float32)
     brightest = sparse.max(axis=2)
