@@ -66,8 +66,6 @@ class DriveResult(NamedTuple):
     exposure: float
     """Factor on the environment, by which the irradiances of lamps and environment are compared."""
     judgement: Judgement
-    limited: int
-    """Number of frames in which a lamp is at its limit."""
     warnings: tuple[str, ...]
 
 
@@ -123,7 +121,7 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
             camera.write(request.out / f"predicted.{number:04d}.exr", quantised.level[index])
             timings.advance(index + 1)
     timings.close()
-    return DriveResult(cues, picture, report, len(numbers), exposure, judgement, int((dilated.radius > 0).sum()), warnings)
+    return DriveResult(cues, picture, report, len(numbers), exposure, judgement, warnings)
 
 
 def _title(number: int, beyond: float, radius: float) -> str:
