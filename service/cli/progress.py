@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Self, TypeVar
 
@@ -85,7 +86,7 @@ def with_bar(work: "Callable[[Given, ProgressBar | OpenJdProgress], Result]", re
         return work(request, bar)
 
 
-class OpenJdProgress:
+class OpenJdProgress(AbstractContextManager["OpenJdProgress"]):
     """A service.reporting.progress.Progress that prints on standard output what the task does, and how much of it is done.
 
     Args:
@@ -96,10 +97,6 @@ class OpenJdProgress:
 
     def __init__(self, counted: tuple[str, ...] | None = COUNTED) -> None:
         self._stage, self._total, self._told, self._counted = "", 0, -1, counted
-
-    def __enter__(self) -> Self:
-        """Return the object: there is nothing to begin."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Print that all is done, unless an error ended it."""

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from types import TracebackType
-from typing import Self
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from kernels import device as devices
 from service.publish.pyramid import TILE, Pyramid
 
 
-class Strips:
+class Strips(AbstractContextManager["Strips"]):
     """Gives pyramids their rows; pixels that never come have the background."""
 
     def __init__(self, rows: int, cols: int, pyramids: Sequence[Pyramid], background: np.ndarray) -> None:
@@ -22,10 +22,6 @@ class Strips:
         self._strip[:] = self._background
         self._row = 0
         self._pool = ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-publish")
-
-    def __enter__(self) -> Self:
-        """Return the strips."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Write the rest, unless something failed."""

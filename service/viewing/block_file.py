@@ -5,8 +5,6 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
@@ -27,15 +25,11 @@ class BlockFile:
 
     def __init__(self, path: Path) -> None:
         """Open the file for writing; what is in it is lost."""
-        self._file = open(path, "wb")  # noqa: SIM115 (closed by __exit__)
+        self._file = open(path, "wb")  # noqa: SIM115 (closed by close)
         self._end = 0
         self._pool = ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-view")
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def close(self) -> None:
         """Close the file."""
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._file.close()

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -130,7 +130,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     space = linear_space(capture.manifest.color_space)
     target = request.out / VIEW_FILE
     sections: dict[str, Any] = {"layers": [], "relight": None, "samples": None, "points": None}
-    with storage("write", target), replacing(request.out / BLOCKS_FILE) as temporary, BlockFile(temporary) as file:
+    with storage("write", target), replacing(request.out / BLOCKS_FILE) as temporary, closing(BlockFile(temporary)) as file:
         if result is not None and result.has_depth:
             timings.stage("points", 1)
             sections["points"] = write_points(result, file)
