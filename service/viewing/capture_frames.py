@@ -65,10 +65,12 @@ class CaptureImages(NamedTuple):
     def white(self) -> float:
         """Return the radiance of white: a percentile of the brightest channel of the mean image; 0 where everything is dark."""
         shown = [image.preview for image, measured in zip(self.images, self.measured, strict=True) if image is not None and measured]
-        if not shown or not self.inside.any():
-            return 0.0
-        mean = np.asarray(np.mean(shown, axis=0, dtype=np.float64))
-        return max(0.0, float(np.percentile(mean[self.inside].max(axis=-1), WHITE_PERCENTILE)))
+        return max(0.0, white_of(np.asarray(np.mean(shown, axis=0, dtype=np.float64)), self.inside)) if shown else 0.0
+
+
+def white_of(radiance: np.ndarray, inside: np.ndarray) -> float:
+    """Return the radiance that is shown as white: a percentile of the brightest channel of those pixels; 0 without any."""
+    return float(np.percentile(radiance[inside].max(axis=-1), WHITE_PERCENTILE)) if inside.any() else 0.0
 
 
 def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> CaptureImages:
@@ -250,9 +252,7 @@ def write_thumbnails(path: Path, found: CaptureImages, space: str) -> list[list[
 
 def _white(found: CaptureImages) -> float:
     """Return the radiance of white: the median over the frames of a percentile of each, so that one bright frame does not darken all."""
-    whites = [float(np.percentile(image.preview[found.inside].max(axis=-1), WHITE_PERCENTILE)) for image in found.images
-              if image is not None and found.inside.any()]
-    lit = [white for white in whites if white > 0]
+    lit = [white for image in found.images if image is not None and (white := white_of(image.preview, found.inside)) > 0]
     return float(np.median(lit)) if lit else 0.0
 
 

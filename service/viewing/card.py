@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.viewing.capture_frames import CaptureImages, fit, one_frame
+from service.viewing.capture_frames import CaptureImages, fit, one_frame, white_of
 from service.viewing.light_transfer import weights_of
 from service.viewing.reduction import TileRow, block_sums, plane_means, put_together
 from stage.capture.capture import Capture
@@ -26,7 +26,6 @@ REACH = 0.85
 """Directions further from the view axis, in the corners of the grid, are brought to this distance from it."""
 FIRST_LIGHT = np.array([0.45, 0.5, 0.74])
 """Direction of the light of the picture: above right of the camera, as on the page that relights."""
-WHITE_PERCENTILE = 99.0
 MAT = 0x2B / 255
 """Display value of the neutral grey behind the object; `--mat` in static/look/tokens.css of the pages is the same."""
 QUALITY = 85
@@ -65,8 +64,7 @@ class RelitCard:
         counted = block_sums(np.ones((*coverage.shape, 1), dtype=np.float32), self._step)[..., 0]
         planes = self._sums.reshape(3, -1, *self._sums.shape[1:]) / counted
         pictures = planes.transpose(1, 2, 3, 0)  # [pictures, rows, cols, 3]
-        covered = shares > 0.5
-        white = float(np.percentile(pictures[0][covered].max(axis=-1), WHITE_PERCENTILE)) if covered.any() else 0.0
+        white = white_of(pictures[0], shares > 0.5)
         shown = [encoded(picture, white, space, shares) for picture in pictures]
         write_picture(folder / PICTURE_FILE, shown[0])
         height, width = (max(1, round(CELL * side / max(shares.shape))) for side in shares.shape)
@@ -83,8 +81,7 @@ def write_photograph(folder: Path, capture: Capture, found: CaptureImages, mask:
         (folder / PICTURE_FILE).unlink(missing_ok=True)
         return
     radiance, coverage = picture
-    inside = coverage > 0.5
-    white = float(np.percentile(radiance[inside].max(axis=-1), WHITE_PERCENTILE)) if inside.any() else 0.0
+    white = white_of(radiance, coverage > 0.5)
     write_picture(folder / PICTURE_FILE, encoded(radiance * coverage[..., None], white, space, coverage))
 
 
