@@ -1,7 +1,6 @@
 """Requests to the service: repeated where that is safe, with errors raised as `ClientError`."""
 
 import random
-import secrets
 import time
 from collections.abc import Callable, Iterator
 from email.utils import parsedate_to_datetime
@@ -61,11 +60,6 @@ class Connection:
             raise Unreachable(f"{server}: is no URL of a service: give one such as https://relit.example")
         self.http = httpx2.Client(base_url=url, headers={} if key is None else {"Authorization": f"Bearer {key}"}, timeout=timeout_s,
                                   transport=transport)
-
-    @staticmethod
-    def new_token() -> str:
-        """Return a new random value for the header Idempotency-Key."""
-        return secrets.token_hex(16)
 
     @staticmethod
     def path(base: str, *parts: str) -> str:

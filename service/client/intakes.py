@@ -1,6 +1,7 @@
 """Captures and environments: uploaded or registered, listed and deleted, and annotated; their files go by tus 1.0."""
 
 import hashlib
+import secrets
 import time
 from base64 import b64encode
 from collections.abc import Iterator
@@ -157,7 +158,7 @@ class Intakes:
         `token` is the Idempotency-Key; None: a new one.
         """
         return self._connection.ask(IntakeView, "POST", self._path, json={"name": name, **({} if path is None else {self._source: path})},
-                                    headers={"Idempotency-Key": token or self._connection.new_token()})
+                                    headers={"Idempotency-Key": token or secrets.token_hex(16)})
 
     def send(self, intake: str, files: list[tuple[Path, str]]) -> None:
         """Send files to an intake that receives them; bytes that the server has are not sent twice, and a file of a path replaces another.

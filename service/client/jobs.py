@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import secrets
 import time
 from collections.abc import Iterator, Sequence
 from glob import escape
@@ -127,7 +128,7 @@ class Jobs:
         The same request with the same token (Idempotency-Key) returns the same job; None: a new job.
         """
         return self._connection.ask(JobView, "POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
-                                    headers={"Idempotency-Key": token or self._connection.new_token()})
+                                    headers={"Idempotency-Key": token or secrets.token_hex(16)})
 
     def get(self, job: str) -> JobView:
         """Return one job."""
@@ -144,7 +145,39 @@ class Jobs:
 
     def follow(self, job: str) -> Iterator[JobView]:
         """Yield the job now, and again after every change, until it has ended."""
-        return follow(self._connection, self._at(job))
+        last: JobView | None = None
+        pause = FIRST_PAUSE_S
+        while True:
+            before = last
+            try:
+                for view in self._stream(job, last):
+                    if last is None or view.revision > last.revision:
+                        last = view
+                        yield view
+                        if view.state in ENDED:
+                            return
+            except httpx2.TransportError:
+                pass
+            if last is not before:
+                pause = FIRST_PAUSE_S
+                continue
+            view = self.get(job)  # its error also says why there are no events
+            if last is None or view.revision > last.revision:
+                last = view
+                yield view
+            if view.state in ENDED:
+                return
+            time.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_S)
+
+    def _stream(self, job: str, last: JobView | None) -> Iterator[JobView]:
+        """Yield the views of one stream of events after `last`; nothing if the service refuses the stream."""
+        headers = {} if last is None else {"Last-Event-ID": str(last.revision)}
+        with self._connection.http.sse(f"{self._at(job)}/events", headers=headers, timeout=SILENCE_S) as events:
+            if events.response.is_success:
+                for event in events:
+                    if event.event == EVENT:
+                        yield JobView.model_validate_json(event.data)
 
     def wait(self, job: str, *, progress: Progress | None = None) -> JobView:
         """Wait until a job has succeeded, and tell `progress` of its stages; raise JobEnded if it failed or was cancelled."""
@@ -206,44 +239,6 @@ class Jobs:
 
     def _at(self, job: str) -> str:
         return self._connection.path(PATH, job)
-
-
-def follow(connection: Connection, job: str) -> Iterator[JobView]:
-    """Yield a job, given by its path in the API, as it is now, and again after every change, until it has ended."""
-    last: JobView | None = None
-    pause = FIRST_PAUSE_S
-    while True:
-        before = last
-        try:
-            for view in _stream(connection, job, last):
-                if last is None or view.revision > last.revision:
-                    last = view
-                    yield view
-                    if view.state in ENDED:
-                        return
-        except httpx2.TransportError:
-            pass
-        if last is not before:
-            pause = FIRST_PAUSE_S
-            continue
-        view = connection.ask(JobView, "GET", job)  # its error also says why there are no events
-        if last is None or view.revision > last.revision:
-            last = view
-            yield view
-        if view.state in ENDED:
-            return
-        time.sleep(pause)
-        pause = min(2 * pause, LONGEST_PAUSE_S)
-
-
-def _stream(connection: Connection, job: str, last: JobView | None) -> Iterator[JobView]:
-    """Yield the views of one stream of events after `last`; nothing if the service refuses the stream."""
-    headers = {} if last is None else {"Last-Event-ID": str(last.revision)}
-    with connection.http.sse(f"{job}/events", headers=headers, timeout=SILENCE_S) as events:
-        if events.response.is_success:
-            for event in events:
-                if event.event == EVENT:
-                    yield JobView.model_validate_json(event.data)
 
 
 HOOKS_PATH = "/v1/hooks"
