@@ -53,12 +53,6 @@ class PartFile:
         self._file = io.FileIO(descriptor, "r+")
         self._lock = threading.Lock()  # so that nobody writes to a descriptor that was closed meanwhile
 
-    @property
-    def size(self) -> int:
-        """Size of the file, bytes; those at its end may not be counted yet."""
-        with self._lock:
-            return os.fstat(self._file.fileno()).st_size
-
     def cut(self, size: int) -> None:
         """Cut the file to `size` bytes, and append from there."""
         with self._lock, storage_errors("write", self.path):
@@ -176,11 +170,6 @@ class StoredPart(PartFile):
         self._parts, self._writer = parts, writer
         self._begin = sum(length for _, length in upload["pieces"])  # where the bytes of this file follow those of the pieces
         self._piece, self._whole = path.with_name(f"{path.name}.piece"), path.with_name(f"{path.name}.whole")  # while they are sent
-
-    @property
-    def size(self) -> int:
-        """Bytes of the pieces and of this file."""
-        return self._begin + super().size
 
     def cut(self, size: int) -> None:
         """Cut the upload to `size` bytes: to none, or behind the pieces."""
