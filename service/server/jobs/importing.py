@@ -12,6 +12,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from service.captures.check_process import check_in_process, import_in_process, propose_in_process
 from service.errors import RequestError
 from service.requests import jobs
 from service.requests.states import CHECKING
@@ -30,8 +31,6 @@ MADE = (FILE_NAME, ".npy")
 
 def look(request: jobs.CheckJob, files: StepFiles) -> None:
     """Record how the files of a capture can be imported."""
-    from service.captures.check_process import propose_in_process
-
     with _links(request.intake, files) as (folder, _):
         proposal = propose_in_process(folder, max_pixels=files.context.settings.max_pixels, progress=files.progress)
     intakes.propose(files.context.database, request.intake, proposal)
@@ -39,7 +38,6 @@ def look(request: jobs.CheckJob, files: StepFiles) -> None:
 
 def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
     """Import the files of a capture as the request says, check what was made, and let the capture be ready with it."""
-    from service.captures.check_process import check_in_process, import_in_process
     from service.captures.importing import still_assumed
 
     context, job, choices = files.context, files.job, request.importing

@@ -9,11 +9,14 @@ from typing import Any
 
 from service.requests import calibrate, calibration_jobs, jobs
 from service.requests.base.base import JobRequest, Options
-from service.requests.basis import BasisKind
+from service.requests.basis import BasisKind, BasisRequest
+from service.requests.captures import ViewRequest
 from service.requests.chart import ChartRequest
 from service.requests.depth import ScanRequest, SeparateRequest
 from service.requests.drive import DriveRequest
+from service.requests.export import ExportRequest
 from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+from service.requests.patterns import PatternsRequest
 from service.requests.rig import RigCalibrationRequest
 from service.requests.shade import ShadeRequest
 from service.requests.solve import JoinRequest
@@ -56,14 +59,12 @@ def _rig(function: str, model: type[Options]) -> Callable[[Any, StepFiles], None
 def export(request: jobs.ExportJob, files: StepFiles) -> None:
     """Make an asset of solved maps or a depth."""
     from service.export.export import export as make_asset
-    from service.requests.export import ExportRequest
 
     files.tell(make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress))
     files.write_annotations(request.rig or request.maps)
 
 
 def _view(request: jobs.ViewJob, files: StepFiles) -> None:
-    from service.requests.captures import ViewRequest
     from service.viewing.view_files import view
 
     capture, cache = files.intake(request.capture, request.step), files.cache(request.capture)
@@ -76,7 +77,6 @@ def _view(request: jobs.ViewJob, files: StepFiles) -> None:
 
 def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
     from service.basis.basis import SUFFIXES, make_basis
-    from service.requests.basis import BasisRequest
 
     kind = BasisKind(request.options.basis)
     options = {name: value for name, value in dict(request.options).items() if name != "basis"}
@@ -86,7 +86,6 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
 
 def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
     from service.depth.patterns.projection import make_patterns
-    from service.requests.patterns import PatternsRequest
 
     options = request.options.model_dump(exclude_defaults=True)  # options of other codes are refused if they are given
     make_patterns(PatternsRequest(out=files.out, **options), files.progress)

@@ -10,11 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from service.captures.check_process import check_in_process
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests import jobs
 from service.requests.base.identifiers import CAPTURE
+from service.requests.depth import DepthRequest, TofOptions
 from service.requests.light.frame_range import frame_numbers, numbered
+from service.requests.register import FuseRequest, RegisterRequest
+from service.requests.relight import RelightRequest
+from service.requests.solve import SolveRequest
 from service.server.base.log import logger
 from service.server.database import intakes, quotas
 from service.server.database.jobs import SEQUENCE
@@ -24,11 +29,10 @@ from service.server.jobs.context import Job, JobStep, StepFiles, WorkerContext, 
 from service.server.jobs.one_step import ONE_STEP, export
 from service.server.jobs.pieces import JobPieces
 from service.server.storage import layout
+from stage.capture.sequence import read_sequence
 from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 
 if TYPE_CHECKING:
-    from service.requests.depth import DepthRequest
-    from service.requests.solve import SolveRequest
     from service.scans.pieces import SharedPieces
 
 TIME_STEP = "step"
@@ -141,35 +145,25 @@ def _join(request: jobs.SolveJob | jobs.DepthJob, files: StepFiles) -> None:
     """Join the time steps of a sequence, each of which is done, and report on all."""
     from service.sequences.run import depth_sequence, solve_sequence
 
-    if isinstance(request, jobs.SolveJob):
-        solving = _solve_request(request, None, files)
-        _fetch(solving, files, layout.SOLVED)
-        files.tell(solve_sequence(solving, files.progress))
-    else:
-        measuring = _depth_request(request, None, files)
-        _fetch(measuring, files, layout.SOLVED)
-        files.tell(depth_sequence(measuring, files.progress))
+    wanted = _solve_request(request, None, files) if isinstance(request, jobs.SolveJob) else _depth_request(request, None, files)
+    _fetch(wanted, files, layout.SOLVED)
+    files.tell(solve_sequence(wanted, files.progress) if isinstance(wanted, SolveRequest) else depth_sequence(wanted, files.progress))
 
 
-def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tuple[str, ...] = ()) -> None:
+def _fetch(request: SolveRequest | DepthRequest, files: StepFiles, names: tuple[str, ...] = ()) -> None:
     """Put onto this machine what the time steps that are done have left for others, and some of their files."""
     from service.sequences.steps import DONE_FILE, result_folder
-    from stage.capture.sequence import read_sequence
 
     folders = [result_folder(request, step).relative_to(request.out) for step in read_sequence(request.capture).steps]
     files.context.storage.local(layout.results(files.job.project, files.job.id),
                                 [f"{folder}/{name}" for folder in folders for name in (*names, DONE_FILE)], files.progress)
 
 
-def _solve_request(request: jobs.SolveJob, number: int | None, files: StepFiles) -> "SolveRequest":
-    from service.requests.solve import SolveRequest
-
+def _solve_request(request: jobs.SolveJob, number: int | None, files: StepFiles) -> SolveRequest:
     return files.request(SolveRequest, request, capture=files.intake(request.capture, number), out=files.out, **dict(request.sequence))
 
 
-def _depth_request(request: jobs.DepthJob, number: int | None, files: StepFiles) -> "DepthRequest":
-    from service.requests.depth import DepthRequest, TofOptions
-
+def _depth_request(request: jobs.DepthJob, number: int | None, files: StepFiles) -> DepthRequest:
     capture = files.intake(request.capture, number)
     calibration = None if request.tof_calibration is None else file_within(capture, request.tof_calibration, "tof_calibration")
     tof = TofOptions(calibration=calibration, **dict(request.options.tof))
@@ -190,7 +184,6 @@ def _frames(job: Job, request: jobs.RelightJob, context: WorkerContext) -> list[
 
 def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> None:
     from service.relight.relight import relight
-    from service.requests.relight import RelightRequest
 
     out = files.out
     wanted = files.request(RelightRequest, request, out=str(out / layout.FRAMES))
@@ -216,8 +209,6 @@ def _is_made(out: Path, number: int) -> bool:
 
 
 def _check(request: jobs.CheckJob, files: StepFiles) -> None:
-    from service.captures.check_process import check_in_process
-
     settings = files.context.settings
     importing.delete_strays(request.intake, files)
     folder, root = files.intake_place(request.intake)
@@ -231,7 +222,6 @@ def _check(request: jobs.CheckJob, files: StepFiles) -> None:
 
 def _register(request: jobs.RegisterJob, files: StepFiles, pieces: JobPieces, *, leads: bool) -> None:
     """Find the poses of the depths of other jobs; the scan-set.json among the results names the jobs, not their folders."""
-    from service.requests.register import RegisterRequest
     from service.scans.register import help_register, register_scans
 
     maps: tuple[str | None, ...] = request.solves or (None,) * len(request.depths)
@@ -251,7 +241,6 @@ def _register(request: jobs.RegisterJob, files: StepFiles, pieces: JobPieces, *,
 
 
 def _fuse(request: jobs.FuseJob, files: StepFiles, pieces: JobPieces, *, leads: bool) -> None:
-    from service.requests.register import FuseRequest
     from service.scans.fusion.fuse import fuse, help_fuse
 
     _, scans = read_scan_set(files.maps(request.registered) / SCAN_SET_FILE)
