@@ -9,7 +9,6 @@ import hashlib
 import importlib.util
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import httpx2
@@ -40,10 +39,10 @@ PROJECT_HEADER = "Relit-Project"
 class TokenReader:
     """Reads tokens of one provider."""
 
-    def __init__(self, settings: Settings, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, settings: Settings) -> None:
         if importlib.util.find_spec("joserfc") is None:
             raise RequestError("oidc_issuer: tokens need the extra oidc: pip install 'relit[oidc]'")
-        self._settings, self._clock = settings, clock
+        self._settings = settings
         self._lock = threading.Lock()
         self._keys: Any = None
         self._fetched_at = self._tried_at = -STALE_S
@@ -71,7 +70,7 @@ class TokenReader:
         from joserfc import jws, jwt
         from joserfc.errors import JoseError
 
-        now = int(self._clock())
+        now = int(time.time())
         rules = jwt.JWTClaimsRegistry(now=now, leeway=LEEWAY_S, iss={"essential": True, "value": str(self._settings.oidc_issuer)},
                                       aud={"essential": True, "value": self._settings.oidc_audience},
                                       exp={"essential": True}, sub={"essential": True})
