@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.printing import tell
+from service.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
     from service.client import Client
@@ -42,7 +43,6 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
 
 def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrupt: bool) -> None:
     """Wait until a job has ended, and fetch what it made into the folder `out`, if there is one; exit with code 1 if it did not succeed."""
-    from service.cli.progress import ProgressBar
     from service.client import JobEnded
 
     try:
@@ -76,8 +76,6 @@ def make_folder(out: Path) -> None:
 
 def download(client: "Client", job: str, out: Path) -> None:
     """Fetch what a job has made."""
-    from service.cli.progress import ProgressBar
-
     with ProgressBar() as bar:
         found = client.jobs.download(job, out, progress=bar)
     last = f" … {found[-1].name}" if len(found) > 1 else ""
