@@ -69,7 +69,7 @@ class SolveOptions(StackOptions):
         f"status unsure. None: {MAX_SIGMA:g}; 180 refuses none."))
     albedo_scale: Positive | None = Field(default=None, description=(
         "Factor of the albedo over that under the lights of the manifest, for captures whose irradiance_scale is relative: 1 keeps it, the "
-        "factor of another report makes both alike. None: the one under which percentile "
+        "factor of another report makes both alike. None: the one that bounced light tells, else that under which percentile "
         f"{ALBEDO_PERCENTILE:g} of the albedo is {BRIGHT_ALBEDO:g}; a sequence has that of its first step. The report records it."))
     least_confidence: Fraction | None = None
     """Least confidence, 0 to 1, of a normal that counts as solved; less certain ones are kept outside the mask, with the status unsure.
