@@ -36,12 +36,14 @@ def block_mean(values: np.ndarray, side: int) -> np.ndarray:
     return values.reshape(rows // side, side, cols // side, side, *values.shape[2:]).mean(axis=(1, 3))
 
 
-def write_small_owl(folder: Path, side: int) -> Path:
-    """The owl as a sensor sees it whose pixels have `side` times the width: every image is averaged over blocks."""
+def write_small_owl(folder: Path, side: int, *, every: int = 1) -> Path:
+    """The owl as a sensor sees it whose pixels have `side` times the width: images are averaged over blocks, and the first of `every` so many
+    of them is taken."""
     manifest = json.loads((OWL / "capture.json").read_text())
     camera = manifest["camera"]
     camera["resolution"] = [pixels // side for pixels in camera["resolution"]]
     camera["pixel_size_m"] *= side
+    manifest["frames"] = manifest["frames"][::every]
     for frame in manifest["frames"]:
         write_exr(folder / frame["image"], block_mean(images.read_pixels(OWL / frame["image"]).astype(np.float32), side))
     write_image(folder / "mask.png", np.where(_inside(side), 255, 0).astype(np.uint8))

@@ -96,9 +96,6 @@ def test_a_folder_or_its_manifest(tmp_path):
     assert by_folder == by_file
     assert by_folder.name == "cap"
     assert (by_folder.mask() == SCENE.mask).all()
-
-
-def test_without_a_mask_every_pixel_counts(tmp_path):
     assert Capture.open(write_capture(tmp_path, SCENE, mask=None)).mask().all()
 
 
@@ -250,11 +247,13 @@ def test_orthographic_points_are_metric_or_in_pixels():
 @pytest.mark.parametrize("camera", [
     perspective(), perspective(distortion=Distortion(model="brown_conrady", k=(-0.1, 0.02, 0.0), p=(0.001, -0.002))),
     Camera(projection="orthographic", resolution=(40, 30), pixel_size_m=0.01, principal_px=(3.0, 8.5))])
-def test_rows_of_the_image_are_those_of_the_whole(camera):
+def test_rows_and_pixels_of_the_image_are_those_of_the_whole(camera):
     height = -1 - np.arange(1200.0).reshape(30, 40) / 1200
     for rows, whole in zip(camera.plane_views(7, 5), camera.plane_coordinates(), strict=True):
         np.testing.assert_array_equal(rows, whole[7:12])
-    np.testing.assert_array_equal(camera.points(height[7:], 7), camera.points(height)[7:])
+    whole, pixels = camera.points(height), np.array([0, 6, 612, 1199])
+    np.testing.assert_array_equal(camera.points(height[7:], 7), whole[7:])
+    np.testing.assert_array_equal(camera.points_at(pixels, height.reshape(-1)[pixels]), whole.reshape(-1, 3)[pixels])
 
 
 @pytest.mark.parametrize(("changes", "words"), [
@@ -270,14 +269,3 @@ def test_rows_of_the_image_are_those_of_the_whole(camera):
 def test_contradictions_are_refused(changes, words):
     with pytest.raises(ValidationError, match=words):
         perspective(**changes)
-
-
-@pytest.mark.parametrize("camera", [
-    Camera(projection="orthographic", resolution=(7, 5), pixel_size_m=0.01),
-    Camera(projection="perspective", resolution=(7, 5), focal_px=(9.0, 9.5), principal_px=(3.0, 2.0),
-           distortion=Distortion(model="brown_conrady", k=(0.1, 0.01, 0.0), p=(0.001, 0.002))),
-], ids=["orthographic", "perspective"])
-def test_points_of_single_pixels_are_those_of_the_image(camera):
-    height = -1.0 - np.arange(35, dtype=np.float32).reshape(5, 7) / 50
-    pixels = np.array([0, 6, 12, 34])
-    assert np.array_equal(camera.points_at(pixels, height.reshape(-1)[pixels]), camera.points(height).reshape(-1, 3)[pixels])

@@ -180,11 +180,6 @@ def test_lights_inside_the_object_or_nearer_than_a_pixel(folder, position):
     assert "z = 0.02 m" in text
 
 
-def test_beside_the_object_a_light_may_stand_lower_than_it(folder):
-    edit_frame(folder, 1, light=point([0.2, 0, -0.1]))
-    assert len(check_solvable(Capture.open(folder)).place) == 4
-
-
 def test_a_perspective_camera(folder):
     edit_manifest(folder, camera=LENS)
     for index, way in enumerate(ring(4)):

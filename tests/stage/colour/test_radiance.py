@@ -44,15 +44,12 @@ def dark_subtracted(size=96, seed=0, filtered=False):
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_impossible_values_are_counted_and_the_first_is_named(tmp_path, bad, words, dtype):
     pixels = UNIT.astype(dtype)
+    pixels[0, 0] = -0.0
     check_radiance("a.exr", pixels)
     pixels[2, 3, 1] = bad
     with pytest.raises(ImageError) as caught:
         check_radiance("a.exr", pixels)
     assert words in str(caught.value)
-
-
-def test_negative_zero_is_zero():
-    check_radiance("a.exr", np.full((1, 1, 3), -0.0, np.float32))
 
 
 @pytest.mark.long
@@ -201,9 +198,6 @@ def test_the_working_space_keeps_the_primaries():
     assert linear_space("lin_ap0_scene") == "lin_ap0_scene"
     with pytest.raises(ValueError, match="rgb is no colour space"):
         linear_space("rgb")
-
-
-def test_an_unknown_space_is_an_error():
     with pytest.raises(ValueError, match="no_such_space"):
         convert(np.zeros((1, 1, 3), dtype=np.float32), "no_such_space", "lin_rec709_scene")
 

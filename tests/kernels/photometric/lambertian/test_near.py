@@ -11,7 +11,7 @@ from kernels.photometric.lambertian.lambert import solve_lambert
 from kernels.photometric.lambertian.near import LEAST_LOBE, NearField, pad_places, see_near
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.lambertian.robust import solve_robust
-from kernels.photometric.model.samples import gather, to_host
+from kernels.photometric.model.samples import gather, host_values, to_host
 from kernels.photometric.shadows.shadowing import exclude_shadows
 from kernels.status import Status
 from kernels.surface.shadows import Projection
@@ -86,19 +86,13 @@ def test_samples_are_the_same_readings(device):
     chosen = RNG.permutation(PIXELS)[:41].astype(np.int32)
     view = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(chosen), 1))
     samples = gather(band, chosen, view, lights(), grey_factors(lights(), GREY), LIGHTS, field().at(chosen))
-
-    def on_host(packed) -> np.ndarray:  # [light, n]
-        values = packed.numpy()
-        if samples.light_stride == 1:
-            values = values.reshape(samples.packs, LIGHTS, -1).transpose(1, 0, 2)
-        return values.reshape(LIGHTS, -1)[:, : len(chosen)]
-
     for c in range(3):
-        np.testing.assert_allclose(on_host(samples.toward[c]), direction[:, chosen, c], atol=1e-6)
+        np.testing.assert_allclose(host_values(samples, samples.toward[c]).T, direction[:, chosen, c], atol=1e-6)
         expected = radiance[c][:, chosen] / STRENGTH[:, c : c + 1] / falloff[:, chosen]
         given = ~saturated[:, chosen]
-        np.testing.assert_allclose(on_host(samples.colour[c])[given], expected[given], rtol=1e-3, atol=1e-6)
-        assert (on_host(samples.colour[c])[~given] == -1).all()
+        colour = host_values(samples, samples.colour[c]).T
+        np.testing.assert_allclose(colour[given], expected[given], rtol=1e-3, atol=1e-6)
+        assert (colour[~given] == -1).all()
     level = to_host(samples, samples.level)
     assert np.isfinite(level).all() and (level > 0).all()
 

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from kernels.photometric.model.chosen_samples import choose
-from kernels.photometric.model.samples import readings_of as host_readings
-from kernels.photometric.model.samples import to_host
 from kernels.photometric.posterior.modes import weigh
 from kernels.photometric.posterior.posterior import Posterior
 from kernels.photometric.posterior.sampling import SamplingFit, sampling_tables, solve_sampling
-from tests.kernels.photometric.sources import CENTRES, LIGHTS, VIEW, readings_of, sphere, table_of
+from tests.kernels.photometric.sources import CENTRES, VIEW, readings_of, sphere, table_of
 from tests.kernels.scenes import angle_degrees
 from tests.reference import sampling as twin
 
@@ -98,14 +95,3 @@ def test_the_better_of_two_modes_is_taken():
 
 def test_neighbouring_modes_are_one():
     assert weigh(posterior(0, 0.5, 20), posterior(2, 0.5, 20)).probability == 1
-
-
-def test_chosen_samples_are_those_of_their_pixels(device):
-    radiance = np.random.default_rng(3).uniform(0.1, 1, (75, LIGHTS))
-    samples = readings_of(radiance, device)
-    picked = np.array([74, 3, 40, 3])
-    part = choose(samples, picked)
-    assert part.pixel_count == 4
-    assert np.array_equal(host_readings(part), host_readings(samples)[picked])
-    assert np.array_equal(to_host(part, part.level), to_host(samples, samples.level)[picked])
-    assert np.array_equal(host_readings(choose(samples, np.arange(75) < 2)), host_readings(samples)[:2])

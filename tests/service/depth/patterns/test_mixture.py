@@ -1,5 +1,7 @@
 """relit depth on wires thinner than two pixels before a wall: a depth is that of the wire or of the wall within its σ, or it is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,7 +49,7 @@ def test_pixels_that_see_wire_and_wall_are_not_sure_of_a_third_place(tmp_path, s
 def test_pixels_that_see_both_sides_of_a_low_step_are_not_sure_of_a_place_between(tmp_path):
     """A step of 25 mm moves places by less than a third of a period, under which no wave contradicts another."""
     steps = [Wall((0.06 * number, 0, -1.2 - 0.025 * (number % 2)), (0, 0, 1), 0.7, half_m=(0.03, 1)) for number in range(-8, 9)]
-    world = World(shapes=(WALL, *steps), rig=RIG)
+    world = World(shapes=(WALL, *steps), rig=replace(RIG, camera=(RIG.camera[0], 40)))
     write_capture(tmp_path, world, PATTERNS["waves"])
     maps = depth_of(tmp_path, read_noise=world.read_noise, photon_gain=1 / world.electrons).maps
     off = np.minimum(np.abs(maps.depth - 1.2), np.abs(maps.depth - 1.225))[maps.mask] / maps.sigma[maps.mask]

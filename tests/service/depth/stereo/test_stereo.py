@@ -30,11 +30,11 @@ PARTS = {
 
 
 @cache
-def seen(name, textures=1, cell=3):
-    """Both views of a scene, and whether the other camera sees each pixel's place."""
+def seen(name, textures=1, cell=3, side=3):
+    """Both views of a scene, and whether the other camera sees each pixel's place; `side`: rays along a side of a pixel."""
     parts = list(PARTS[name])
     patterns = [scenes.dots(100 + i, cell=cell) for i in range(textures)]
-    left, right = (scenes.render(parts, patterns, *camera, side=3) for camera in ((CAMERA,), (OTHER, POSE)))
+    left, right = (scenes.render(parts, patterns, *camera, side=side) for camera in ((CAMERA,), (OTHER, POSE)))
     return left, right, scenes.visible_to(parts, left.points, POSE)
 
 
@@ -181,7 +181,7 @@ def test_cameras_that_boards_have_calibrated_raise_no_doubt(relit, tmp_path, see
 
 
 def test_rows_that_lie_far_apart_are_named(relit, tmp_path):
-    left, right, _ = seen("plane and sphere")
+    left, right, _ = seen("plane and sphere", side=2)
     folder = write(tmp_path, left.images, right.images, pose=turned(-0.6, 0, 0))
     says = relit("depth", folder, "--out", folder / "out").refused("other_cameras[0]")
     assert "4 px lower" in says and "0.55°" in says
@@ -190,7 +190,7 @@ def test_rows_that_lie_far_apart_are_named(relit, tmp_path):
 @pytest.mark.parametrize("how", ["inverse", *(pytest.param(how, marks=pytest.mark.long) for how in ("mirrored", "turned"))])
 def test_what_no_calibration_explains_is_not_believed(relit, tmp_path, how):
     """A part of the pixels matches all the same."""
-    left, right, _ = seen("plane and sphere")
+    left, right, _ = seen("plane and sphere", side=2)
     flip = {"inverse": np.s_[:, :, :], "mirrored": np.s_[:, :, ::-1], "turned": np.s_[:, ::-1, ::-1]}[how]
     folder = write(tmp_path, left.images[flip], right.images[flip], pose=np.linalg.inv(POSE) if how == "inverse" else POSE)
     outcome = relit("depth", folder, "--out", folder / "out")

@@ -44,7 +44,7 @@ def missed(found, factor, untold):
 def wrong(tmp_path_factory):
     factor = np.exp(np.random.default_rng(2).normal(0, 0.06, LIGHTS))
     factor[GROSS] = 0.4
-    return factor, *solved(tmp_path_factory.mktemp("wrong"), factor)
+    return factor, *solved(tmp_path_factory.mktemp("wrong"), factor, "robust")
 
 
 def test_wrong_intensities_are_estimated_and_reported(wrong):

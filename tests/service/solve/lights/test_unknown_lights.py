@@ -90,7 +90,7 @@ def solved(tmp_path, scene, method="robust", **options):
 
 @pytest.fixture(scope="module")
 def glossy(tmp_path_factory):
-    scene = shiny(ellipsoid(count=LIGHTS), (0.45, 0.6), 0.08)
+    scene = shiny(ellipsoid(size=48, count=LIGHTS), (0.45, 0.6), 0.08)
     return scene, *solved(tmp_path_factory.mktemp("glossy"), scene)
 
 

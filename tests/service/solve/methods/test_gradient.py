@@ -32,7 +32,7 @@ def diffuse() -> np.ndarray:
 @pytest.fixture(scope="module")
 def highlight() -> np.ndarray:
     view = np.array([0.0, 0.0, 1.0])
-    return shaded(lambda n, axis, sign: reference.ggx(n, view, axis, sign, alpha=ROUGHNESS**2, f0=0.04, nodes=40, turns=60))
+    return shaded(lambda n, axis, sign: reference.ggx(n, view, axis, sign, alpha=ROUGHNESS**2, f0=0.04, nodes=20, turns=30))
 
 
 def write(folder, groups: dict[str, np.ndarray], **changes):
