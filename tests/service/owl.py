@@ -37,8 +37,8 @@ def block_mean(values: np.ndarray, side: int) -> np.ndarray:
 
 
 def write_small_owl(folder: Path, side: int, *, every: int = 1) -> Path:
-    """The owl as a sensor sees it whose pixels have `side` times the width: images are averaged over blocks, and the first of `every` so many
-    of them is taken."""
+    """The owl as a sensor sees it whose pixels have `side` times the width: images are averaged over blocks; of `every` so many the first
+    is taken."""
     manifest = json.loads((OWL / "capture.json").read_text())
     camera = manifest["camera"]
     camera["resolution"] = [pixels // side for pixels in camera["resolution"]]

@@ -178,15 +178,6 @@ def test_places_near_the_border_are_inside(device):
     np.testing.assert_allclose(coordinate, u, atol=2e-4)  # float32 near a thousand
 
 
-def test_nothing_is_nan_whatever_the_input(device):
-    patterns = phase_patterns("column", (16, 18, 21), 4)
-    stack = np.random.default_rng(7).choice([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 1, 65504], size=(len(patterns), 4000),
-                                            p=[0.02, 0.02, 0.02, 0.04, 0.3, 0.2, 0.3, 0.1])
-    wrapped = wrapped_of(stack, patterns, device)
-    for array in (*wrapped[:4], *unwrap_jointly(wrapped, extent=WIDTH)):
-        assert np.isfinite(array.numpy()).all()
-
-
 def frames(device, count=8):
     return upload(np.zeros((count, 4), dtype=np.float32), device=device)
 

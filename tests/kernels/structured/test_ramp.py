@@ -64,13 +64,6 @@ def test_statuses(device):
     assert [Status(s).name for s in result(decoded, 4)[3]] == ["OK", "SHADOWED", "OUT_OF_RANGE", "SATURATED"]
 
 
-def test_nothing_is_nan_whatever_the_input(device):
-    stack = np.random.default_rng(7).choice([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 1, 65504], size=(4, 4000))
-    for given in ({"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}):
-        for array in decode_ramp(frames_of(stack, device), **given, black=BLACK, extent=WIDTH, noise=NOISE):
-            assert np.isfinite(array.numpy()).all()
-
-
 @pytest.mark.parametrize("options, words", [
     ({"up": 0}, "a frame is missing"), ({}, "a frame is missing"), ({"up": 0, "down": 0}, "frame 0 is given for two patterns"),
     ({"up": 0, "down": 1, "response": np.array([0, 0.5, 0.5, 1])}, "each above the one before"),

@@ -146,13 +146,6 @@ def test_codes_beyond_the_projector_are_out_of_range(device):
     np.testing.assert_array_equal(status == Status.OUT_OF_RANGE, u >= 600)
 
 
-def test_nothing_is_nan_whatever_the_input(device):
-    patterns = patterns_of("gray")
-    stack = np.random.default_rng(7).choice([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 1, 65504], size=(len(patterns), 2000))
-    for array in decode(stack, patterns, device):
-        assert np.isfinite(array).all()
-
-
 def bounced(patterns, device):
     """Part of wrong results and of refused pixels where a facing surface adds light."""
     u = places(20000, WIDTH)

@@ -11,7 +11,7 @@ from service.solve.solve import solve
 from stage.errors import ManifestError
 from tests.scenes.captures import distant, ring, write_lit
 
-SIDE, RADIUS = 64, 0.55
+SIDE, RADIUS = 48, 0.55
 
 
 def ball(albedo: float, back: float, lights: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,5 +71,5 @@ def test_what_a_lamp_lights_is_no_background(tmp_path, albedo, back, noise):
 def test_a_mask_beside_the_object_is_refused(tmp_path):
     """A corner of the background has nothing to solve."""
     with pytest.raises(ManifestError, match="mask: no light"):
-        solved(tmp_path, 0.5, 0.0, 0.002, cut=True, mask=np.add.outer(np.arange(SIDE), np.arange(SIDE)) < 16)
+        solved(tmp_path, 0.5, 0.0, 0.002, cut=True, mask=np.add.outer(np.arange(SIDE), np.arange(SIDE)) < SIDE // 4)
     assert not (tmp_path / "out").exists()

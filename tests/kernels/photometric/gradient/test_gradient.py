@@ -40,7 +40,7 @@ def lambert_shading(normal: np.ndarray, frames) -> np.ndarray:
 
 def lobe_shading(normal: np.ndarray, frames, *, roughness: float, f0: float) -> np.ndarray:
     """[frame, pixel] radiance of a GGX lobe, by quadrature."""
-    return np.array([[reference.ggx(n, VIEW, axis, sign, alpha=roughness**2, f0=f0, nodes=60, turns=90) for n in normal]
+    return np.array([[reference.ggx(n, VIEW, axis, sign, alpha=roughness**2, f0=f0, nodes=30, turns=48) for n in normal]
                      for axis, sign in frames])
 
 

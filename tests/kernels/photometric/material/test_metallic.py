@@ -81,7 +81,7 @@ def test_the_metalness_of_least_misfit(device):
         colour = np.clip((weights * lobe * left).sum(axis=-1) / (weights * lobe * lobe).sum(), 0, 1)
         return (weights * (left - colour[:, None] * lobe) ** 2).sum(), colour
 
-    grid = np.linspace(0, 1, 2001)
+    grid = np.linspace(0, 1, 501)
     best = np.array([grid[np.argmin([misfit(m, i)[0] for m in grid])] for i in range(20)])
     np.testing.assert_allclose(found[3], best, atol=0.008)
     np.testing.assert_allclose(found[:3].T, [misfit(m, i)[1] for i, m in enumerate(found[3])], atol=1e-4)

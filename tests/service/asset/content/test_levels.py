@@ -10,6 +10,7 @@ from service.asset.content.mesh import height_mesh
 from service.asset.content.tangent import TangentFrames, vertex_tangents
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
+from tests.service.asset.content.manifold import check_manifold
 
 SIZE = 96
 ORTHOGRAPHIC = Camera(projection="orthographic", resolution=(SIZE, SIZE), pixel_size_m=0.01)
@@ -119,19 +120,7 @@ def test_levels_are_manifold(seed):
     mask = maps.mask & (rng.random(maps.mask.shape) < (0.75, 0.9, 0.98)[seed % 3])
     mesh = height_mesh(dataclasses.replace(maps, mask=mask))
     for level in level_meshes(mesh, ORTHOGRAPHIC, 3):
-        faces = level.triangles.tolist()
-        directed = [(face[k - 1], face[k]) for face in faces for k in range(3)]
-        assert len(set(directed)) == len(directed)
-        around: dict[int, dict[int, int]] = {}
-        for face in faces:
-            for k in range(3):
-                around.setdefault(face[k], {})[face[(k + 1) % 3]] = face[k - 1]
-        for following in around.values():
-            start = next(iter(set(following) - set(following.values()) or following))
-            at, length = start, 0
-            while at in following and length < len(following):
-                at, length = following[at], length + 1
-            assert length == len(following)
+        check_manifold(level.triangles.tolist())
         assert len(np.unique(level.st, axis=0)) == len(np.unique(level.points, axis=0)) == len(level.points)
 
 

@@ -50,6 +50,24 @@ def rewritten(path, change):
     return with_document(path, json.dumps(document).encode(), rest)
 
 
+def overwritten(path, view, raw):
+    """The same file with other bytes at the beginning of a view into its buffer, which its document chooses."""
+    document, rest = chunks(path)
+    at = 8 + view(document).get("byteOffset", 0)
+    return with_document(path, json.dumps(document).encode(), rest[:at] + raw + rest[at + len(raw):])
+
+
+def view_of(name):
+    """A choice for `overwritten`: the view of an attribute, of the indices or of the first image."""
+    def choose(document):
+        primitive = document["meshes"][0]["primitives"][0]
+        if name == "image":
+            return document["bufferViews"][document["images"][0]["bufferView"]]
+        accessor = document["accessors"][primitive["indices"] if name == "indices" else primitive["attributes"][name]]
+        return document["bufferViews"][accessor["bufferView"]]
+    return choose
+
+
 def test_facts(tmp_path):
     path, mesh = written(tmp_path), height_mesh(make_ball())
     found = inspect_glb(path)
@@ -221,17 +239,7 @@ def test_a_depth_becomes_a_glb(geometry, mode, tmp_path):
     ("image", b"damaged!", "is no image that can be read, or a damaged one"),
 ])
 def test_faults_of_geometry_and_textures_are_errors(name, value, sentence, tmp_path):
-    path = written(tmp_path)
-    document, rest = chunks(path)
-    primitive = document["meshes"][0]["primitives"][0]
-    if name == "image":
-        view = document["bufferViews"][document["images"][0]["bufferView"]]
-    else:
-        accessor = document["accessors"][primitive["indices"] if name == "indices" else primitive["attributes"][name]]
-        view = document["bufferViews"][accessor["bufferView"]]
-    at = 8 + view.get("byteOffset", 0)
-    raw = value if isinstance(value, bytes) else value.tobytes()
-    with_document(path, json.dumps(document).encode(), rest[:at] + raw + rest[at + len(raw):])
+    path = overwritten(written(tmp_path), view_of(name), value if isinstance(value, bytes) else value.tobytes())
     assert any(re.search(sentence, error) for error in inspect_glb(path).errors)
 
 
@@ -272,11 +280,7 @@ def test_what_a_document_says_wrongly_of_its_arrays_is_an_error(change, sentence
     ("TANGENT", (1, 0, 0, 0), "TANGENT: the fourth component of 1 of its"),
 ])
 def test_directions_have_length_1(name, value, sentence, tmp_path):
-    path = written(tmp_path)
-    document, rest = chunks(path)
-    at, raw = 8 + document["bufferViews"][attribute(document, name)["bufferView"]].get("byteOffset", 0), np.float32(value).tobytes()
-    with_document(path, json.dumps(document).encode(), rest[:at] + raw + rest[at + len(raw):])
-    errors = inspect_glb(path).errors
+    errors = inspect_glb(overwritten(written(tmp_path), view_of(name), np.float32(value).tobytes())).errors
     assert len(errors) == (sentence is not None) and all(re.search(str(sentence), error) for error in errors)
 
 

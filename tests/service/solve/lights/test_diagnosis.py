@@ -73,12 +73,11 @@ def test_wrong_axes_are_named_and_doubted(tmp_path, matrix, words):
     assert not result.maps.estimated.any() or confidence(result) < UNSURE
 
 
-@pytest.mark.parametrize(("scene", "words"), [
-    (SCENE, None),
-    (SCENE._replace(directions=np.roll(SCENE.directions, 1, 0), irradiance=np.roll(SCENE.irradiance, 1, 0)), "one frame off"),
-], ids=["right", "one frame off"])
-def test_a_dark_background_without_a_mask_hides_no_wrong_order(tmp_path, scene, words):
+@pytest.mark.parametrize(("shift", "words"), [(0, None), (1, "one frame off")], ids=["right", "one frame off"])
+def test_a_dark_background_without_a_mask_hides_no_wrong_order(tmp_path, shift, words):
     """The object takes a seventh of the image; the rest is the noise of a camera."""
+    small = ellipsoid(size=48)
+    scene = small._replace(directions=np.roll(small.directions, shift, 0), irradiance=np.roll(small.irradiance, shift, 0))
     wide = [(0, 0), *[(side, side) for side in scene.mask.shape], (0, 0)]
     images = np.pad(scene.images * scene.mask[..., None], wide)
     noise = np.random.default_rng(5).normal(0, 1e-3 * scene.images.max(), images.shape)
