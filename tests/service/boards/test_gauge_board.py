@@ -119,7 +119,7 @@ def test_one_operator_tells_the_repeatability_alone():
     study = gauge_study(AIAG[:, :1])
     assert study.reproducibility is None and study.interaction is None
     assert study.repeatability == pytest.approx(np.sqrt(AIAG[:, 0].var(axis=1, ddof=1).mean()))
-    assert study.gauge == study.repeatability
+    assert study.gauge == study.repeatability and study.gauge_bound == pytest.approx(study.repeatability_bound)
 
 
 def test_too_little_is_refused():
@@ -173,11 +173,6 @@ def test_the_gauge_is_below_its_bounds_with_95_percent(shape, operators):
         below.append((truth <= study.gauge_bound, 100 * truth / np.hypot(truth, 5) <= study.gauge_percent_bound))
     share = np.mean(below, axis=0)
     assert (share > 0.927).all() and (operators < 5 or (share < 0.973).all())
-
-
-def test_the_bound_of_one_operator_is_that_of_the_repeatability():
-    study = gauge_study(AIAG[:, :1])
-    assert study.gauge_bound == pytest.approx(study.repeatability_bound)
 
 
 def test_a_bound_beyond_a_limit_that_the_gauge_is_below_is_said(relit, tmp_path):

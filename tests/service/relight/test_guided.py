@@ -29,9 +29,9 @@ def scene(tmp_path_factory):
     sky = sky.astype(np.float32).astype(np.float64)  # as the file has it
     truth = np.zeros((*SURFACE.mask.shape, 3))
     for row in range(len(sky)):
-        lit = reflect(SURFACE.normal[:, :, None], directions[row])  # [rows, cols, texels, 3]
-        truth += np.einsum("rctk,tk->rck", lit, sky[row] * solid_angle[row])
-    return folder, truth * SURFACE.mask[..., None]
+        lit = reflect(SURFACE.normal[SURFACE.mask][:, None], directions[row])  # [pixels, texels, 3]
+        truth[SURFACE.mask] += np.einsum("ptk,tk->pk", lit, sky[row] * solid_angle[row])
+    return folder, truth
 
 
 def relight(relit, folder, out, *options):

@@ -8,7 +8,7 @@ from service.scans.viewpoints import find_viewpoints
 
 def cap(*, hollow: bool) -> tuple[np.ndarray, np.ndarray]:
     """Points of a third of a ball around the origin that is seen from above and their normals: of its top, or of a bowl, its bottom."""
-    normals = np.random.default_rng(5).normal(size=(8000, 3))
+    normals = np.random.default_rng(5).normal(size=(4000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals[normals[:, 2] > 0.4]
     return (normals * [1, 1, -1], normals * [-1, -1, 1]) if hollow else (normals, normals.copy())

@@ -103,22 +103,12 @@ def test_highlights_tell_normals_without_lights(glossy):
     assert np.mean(angles_degrees(np.array(told["directions"]), scene.directions)) < 4
 
 
-def test_irradiance_is_found_up_to_one_factor(glossy):
-    scene, _, report, _ = glossy
-    ratio = np.array(report["found"]["unknown_lights"]["irradiance"]) / scene.irradiance[:, 0]
-    assert np.std(np.log(ratio)) < 0.05  # the declared ones vary by 35 %
-
-
-def test_the_standard_error_counts_the_lights(glossy):
-    _, result, report, error = glossy
-    sigma = result.maps.sigma[result.maps.estimated]
-    assert np.median(sigma) >= report["found"]["unknown_lights"]["sigma_degrees"] * 0.9
-    assert np.mean(error < 2 * sigma) > 0.9
-
-
-def test_the_report_says_that_the_manifest_has_other_lights(glossy):
-    _, result, *_ = glossy
-    assert any("found.unknown_lights" in warning for warning in result.warnings)
+def test_irradiance_is_found_up_to_one_factor_and_sigma_counts_the_lights(glossy):
+    scene, result, report, error = glossy
+    told, sigma = report["found"]["unknown_lights"], result.maps.sigma[result.maps.estimated]
+    assert np.std(np.log(np.array(told["irradiance"]) / scene.irradiance[:, 0])) < 0.05  # the declared ones vary by 35 %
+    assert np.median(sigma) >= told["sigma_degrees"] * 0.9 and np.mean(error < 2 * sigma) > 0.9
+    assert any("found.unknown_lights" in warning for warning in result.warnings)  # the manifest has other lights
 
 
 @pytest.mark.long
