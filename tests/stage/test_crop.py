@@ -70,14 +70,10 @@ def test_a_part_outside_the_images_is_named(tmp_path, crop, words):
         Capture.open(tmp_path, PixelChoices(crop=crop))
 
 
-def test_a_part_without_the_object_is_named(tmp_path):
+def test_a_part_without_the_object_and_a_mask_of_another_size_are_named(tmp_path):
     write_capture(tmp_path, SCENE)
     with pytest.raises(ImageError, match=r"mask\.png: the mask is empty in --crop 0,0,2,2"):
         Capture.open(tmp_path, PixelChoices(crop=Crop(0, 0, 2, 2))).mask()
-
-
-def test_image_sizes_are_those_of_the_files(tmp_path):
-    write_capture(tmp_path, SCENE)
     write_image(tmp_path / "mask.png", np.full((7, 9), 255, np.uint8))  # of the part, where that of the whole is expected
     with pytest.raises(ImageError, match=r"mask\.png: is 9x7, camera\.resolution says 16x16"):
         Capture.open(tmp_path, PART)

@@ -183,15 +183,11 @@ def test_distances_and_sides_of_an_octahedron(device, scale, at):
     assert found.share.min() > -1e-6 and np.allclose(found.share.sum(axis=1), 1)
 
 
-def test_what_is_too_far_has_no_face(device):
+def test_what_is_too_far_has_no_face_and_faces_need_their_points(device):
     corners, faces = octahedron()
     found = NearestOnMesh(corners, faces, device=device).search(np.array([[0.0, 0, 3.0], [0, 0, 1.05]]), 0.1)
     assert found.face[0] == -1 and found.face[1] >= 0
     assert len(NearestOnMesh(corners, faces, device=device).search(np.zeros((0, 3)), 1.0).face) == 0
-
-
-def test_faces_need_their_points(device):
-    corners, faces = octahedron()
     for wrong in (faces[:0], faces + 1):
         with pytest.raises(ArrayError, match="points"):
             NearestOnMesh(corners, wrong, device=device)

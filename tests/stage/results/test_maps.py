@@ -109,7 +109,12 @@ def write(path, channels, **metadata):
     return path
 
 
-def test_what_is_not_a_maps_file_is_named(tmp_path):
+def test_what_is_not_a_maps_file_or_only_a_part_of_one_is_named(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    (tmp_path / "maps.exr").write_bytes((tmp_path / "maps.exr").read_bytes()[:-10])
+    with pytest.raises(ImageError, match=r"maps\.exr: is truncated"):
+        SurfaceMaps.read(tmp_path / "maps.exr")
+    assert files_in(tmp_path) == {"maps.exr"}
     plane = np.ones((ROWS, COLS), np.float32)
     camera = {"relit:camera": CAMERA.model_dump_json()}
     with pytest.raises(ResultError, match=r"a\.exr: carries no relit:camera attribute"):
@@ -123,14 +128,6 @@ def test_what_is_not_a_maps_file_is_named(tmp_path):
     for name, text in (("e", "{"), ("f", "{}"), ("g", '{"projection": "fisheye"}')):
         with pytest.raises(ResultError, match=rf"{name}\.exr: its relit:camera attribute is not a camera"):
             SurfaceMaps.read(write(tmp_path / f"{name}.exr", {"mask.Y": plane}, **{"relit:camera": text}))
-
-
-def test_a_truncated_maps_file_is_named(tmp_path):
-    make_maps().write(tmp_path / "maps.exr")
-    (tmp_path / "maps.exr").write_bytes((tmp_path / "maps.exr").read_bytes()[:-10])
-    with pytest.raises(ImageError, match=r"maps\.exr: is truncated"):
-        SurfaceMaps.read(tmp_path / "maps.exr")
-    assert files_in(tmp_path) == {"maps.exr"}
 
 
 def test_layers_are_named_masked_and_of_their_type(tmp_path):

@@ -94,10 +94,11 @@ def test_a_sun_is_a_few_marches_from_within_it():
     assert np.bincount(got.occluder[:, 0] - FIRST).max() < 3 * len(directions) / 24  # evenly, about
 
 
-def test_samples_in_one_place_are_one_group():
-    given = sources.far(np.tile([[0.6, 0, 0.8]], (7, 1)), np.ones((7, 3)))
-    got, places = grouped(given, np.ones(7, dtype=bool), FIRST, most=5, reach=0.0)
-    assert len(places) == 1 and (got.occluder[:, 0] == FIRST).all()
+def test_samples_in_one_place_and_dark_ones_are_one_group():
+    alike = sources.far(np.tile([[0.6, 0, 0.8]], (7, 1)), np.ones((7, 3)))
+    for samples, most, reach in ((alike, 5, 0.0), (shadowed(9)._replace(energy=np.zeros((9, 3), np.float32)), 4, 1e30)):
+        got, places = grouped(samples, np.ones(len(samples.energy), dtype=bool), FIRST, most=most, reach=reach)
+        assert len(places) == 1 and (got.occluder[:, 0] == FIRST).all()
 
 
 def test_energy_below_none_weighs_as_much():
@@ -106,12 +107,6 @@ def test_energy_below_none_weighs_as_much():
     expected, same = grouped(given, np.ones(50, dtype=bool), FIRST, most=6, reach=0.5)
     np.testing.assert_array_equal(places, same)
     np.testing.assert_array_equal(got.occluder, expected.occluder)
-
-
-def test_dark_samples_are_one_group():
-    given = shadowed(9)._replace(energy=np.zeros((9, 3), np.float32))
-    got, places = grouped(given, np.ones(9, dtype=bool), FIRST, most=4, reach=1e30)
-    assert len(places) == 1 and (got.occluder[:, 0] == FIRST).all()
 
 
 @pytest.mark.parametrize("count", [0, 12])
