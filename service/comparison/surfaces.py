@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from kernels.surface.nearest import NearestOnMesh
 from service.scans.fusion.fuse import MESH_FILE
+from service.scans.fusion.holes import vertex_vectors
 from service.scans.points.planes import local_planes, robust_scatter
 from service.scans.points.ply_points import PlyPoints, read_ply_faces, read_ply_points
 from service.scans.viewpoints import find_viewpoints
@@ -153,7 +154,7 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         raise ResultError(f"{file}: has {len(points)} different points: {LEAST_SCAN} are the fewest that are compared")
     fitted = normals is None and faces is None
     if normals is None:
-        normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
+        normals = _estimated_normals(points, file) if faces is None else vertex_vectors(points, faces)
     normals = np.nan_to_num(normals, posinf=0, neginf=0)
     outward = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     bare = ~outward.any(axis=1)
@@ -196,10 +197,3 @@ def _estimated_normals(points: np.ndarray, file: Path) -> np.ndarray:
         raise ResultError(f"{file}: has neither faces nor normals, and nothing else says which side of its points is outside: "
                           f"{found.reason}")
     return local_planes(points.astype(np.float32), origin=found.place[0]).normals.astype(np.float64)
-
-
-def _normals_of_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the normals of vertices [n, 3], those of their faces weighted by area; 0 of a vertex without faces."""
-    corners = points[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.stack([np.bincount(faces.reshape(-1), np.repeat(column, 3), minlength=len(points)) for column in across.T], axis=1)

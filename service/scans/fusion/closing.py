@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from service.scans.fusion.holes import area_vectors, simple_chains
+from service.scans.fusion.holes import simple_chains, vertex_vectors
 
 SPANNED_WHOLE = 64
 """Vertices of a chain up to which all of its triangles are chosen together: the work grows with the third power of their number."""
@@ -50,8 +50,7 @@ class Closed:
 def close_pinholes(points: np.ndarray, faces: np.ndarray, width_m: float) -> Closed:
     """Close the holes of a mesh of points [V, 3] and faces [F, 3] that are nowhere wider than `width_m`, each by a fan around its middle.
     A chain around a speck, whose faces lie inside of it, is no hole."""
-    across = area_vectors(points, faces)
-    normals = np.stack([np.bincount(faces.ravel(), np.repeat(across[:, axis], 3), minlength=len(points)) for axis in range(3)], axis=1)
+    normals = vertex_vectors(points, faces)
     fans: list[np.ndarray] = [np.zeros((0, 3), dtype=np.int64)]
     middles: list[np.ndarray] = []
     holes = 0

@@ -75,6 +75,12 @@ def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(second - first, third - first)
 
 
+def vertex_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return for each vertex the sum of the area vectors of the faces around it, [V, 3] float64; 0 of a vertex without faces."""
+    return np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), minlength=len(points)) for column in area_vectors(points, faces).T],
+                    axis=1)
+
+
 def _face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the area of each face, [F] float64."""
     areas = np.empty(len(faces))

@@ -24,6 +24,7 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import cg
 
 from service.scans.fusion.bands import Bands
+from service.scans.fusion.holes import area_vectors, vertex_vectors
 
 BOUND_SIGMAS = 4.0
 """A vertex moves no farther than this many standard deviations of its depth: where normals ask for more, the depth decides."""
@@ -117,8 +118,7 @@ def join_normals(points: np.ndarray, faces: np.ndarray, sigma: np.ndarray, norma
 
 def _mesh(points: np.ndarray, faces: np.ndarray) -> _Mesh:
     count = len(points)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    double = np.linalg.norm(area_vectors(points, faces), axis=1)
     area = np.bincount(faces.ravel(), np.repeat(double / 6, 3), minlength=count)
     ends, cotangents = [], []
     for k in range(3):
@@ -133,9 +133,7 @@ def _mesh(points: np.ndarray, faces: np.ndarray) -> _Mesh:
 
 def _face_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the normals [V, 3] of vertices: the normalised sums of the area vectors around."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    vector = np.cross(b - a, c - a)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), minlength=len(points)) for column in vector.T], axis=1)
+    total = vertex_vectors(points, faces)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float64).tiny))
 
 
