@@ -16,7 +16,6 @@ from service.comparison.deviations import (
     deviations_of,
     inside,
     patches_of,
-    sigma_of,
     standing_on,
     table,
 )
@@ -107,7 +106,8 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     placement = _place(request, design, scan, reach, regions, unit_m)
     timings.stage("deviations", 1)
     found = deviations_of(design, scan, placement, reach)
-    sigma = sigma_of(found, placement, request.shared_sigma_m)
+    by_pose = np.einsum("mi,ij,mj->m", found.moves, placement.covariance, found.moves)
+    sigma = np.sqrt(found.noise**2 + by_pose + request.shared_sigma_m**2)
     timings.stage("patches", 1)
     spacing = _spacing(scan.points)
     patch = PATCH_SPACINGS * spacing if request.smallest_fault_m is None else request.smallest_fault_m / 2

@@ -14,6 +14,7 @@ from service.boards.stitching.significance import threshold
 from service.comparison.patch_errors import shared_error
 from service.comparison.placing import ALIKE, Placement, gradient
 from service.comparison.surfaces import Design, Offsets, ScannedSurface
+from service.scans.points.cloud import cell_numbers
 from service.scans.points.rigid import applied
 from stage.errors import ScanError
 from stage.formats.csv_table import table_text
@@ -123,20 +124,12 @@ def _at_edge(samples: np.ndarray, facing: np.ndarray, points: np.ndarray, within
     return np.asarray((np.isfinite(near) & (np.abs(cosine) < ALIKE)).any(axis=1))
 
 
-def sigma_of(found: Deviations, placement: Placement, shared_m: float) -> np.ndarray:
-    """Return σ of each deviation [m], metres: of the point, of the pose, and of errors that all points share."""
-    pose = np.einsum("mi,ij,mj->m", found.moves, placement.covariance, found.moves)
-    return np.asarray(np.sqrt(found.noise**2 + pose + shared_m**2))
-
-
 def patches_of(found: Deviations, design: Design, placement: Placement, *, patch_m: float, shared_m: float) -> Patches:
     """Return the means over patches: the points of a cell of a side in metres that face about the same way."""
     normal = design.normals[found.face]
-    cell = np.floor((found.at - found.at.min(axis=0)) / patch_m).astype(np.int64)
     largest = np.abs(normal).argmax(axis=1)
     facing = 2 * largest + (normal[np.arange(len(normal)), largest] > 0)
-    size = cell.max(axis=0) + 1
-    _, of_point, count = np.unique((cell @ np.array([1, size[0], size[0] * size[1]])) * 6 + facing, return_inverse=True, return_counts=True)
+    _, of_point, count = np.unique(cell_numbers(found.at, patch_m) * 6 + facing, return_inverse=True, return_counts=True)
     kept = count >= LEAST_POINTS
 
     def mean(values: np.ndarray) -> np.ndarray:

@@ -67,7 +67,7 @@ def thinned_scan(scan: Scan) -> Thinned:
     kept = drawn = np.random.default_rng(0).permutation(len(thinned.points))  # in their order the first would be the lowest of the noise
     while len(kept) > MOST_POINTS:
         cell *= max(1.02, float(np.sqrt(len(kept) / MOST_POINTS)))
-        kept = drawn[np.unique(_cells(thinned.points[drawn], cell), return_index=True)[1]]
+        kept = drawn[np.unique(cell_numbers(thinned.points[drawn], cell), return_index=True)[1]]
     kept = np.sort(kept)
     return Thinned(thinned.points[kept], thinned.directions[kept], thinned.sigma[kept], even=not squares)
 
@@ -118,7 +118,7 @@ def _planes(around: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.
 
 def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell: float) -> Thinned:
     """Return the means of points [n, 3] in cells of a side, metres, with the σ of the means; the variance is along the directions."""
-    _, of_point, count = np.unique(_cells(points, cell), return_inverse=True, return_counts=True)
+    _, of_point, count = np.unique(cell_numbers(points, cell), return_inverse=True, return_counts=True)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.bincount(of_point, values, minlength=len(count)) / count
@@ -129,8 +129,8 @@ def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell:
     return Thinned(averaged, middle, np.sqrt(mean(variance) / count))
 
 
-def _cells(points: np.ndarray, cell: float) -> np.ndarray:
-    """Return the number of the cell of each point, [n] int64."""
+def cell_numbers(points: np.ndarray, cell: float) -> np.ndarray:
+    """Return the number of the cell of each point [n, 3], [n] int64: of a grid of cells of a side, metres, around all points."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = index.max(axis=0) + 1
     return index @ np.array([1, size[0], size[0] * size[1]])

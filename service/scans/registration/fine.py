@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.scans.points.cloud import Cloud
+from service.scans.points.cloud import Cloud, cell_numbers
 from service.scans.points.neighbours import NearestWithin
 from service.scans.points.rigid import applied, moved
 from service.scans.registration.coarse import ALIKE
@@ -142,9 +142,7 @@ def _together(found: "_Matches", system: "_System", block_m: float) -> float:
     Source: Liang and Zeger, "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986: sums over blocks in place of
     single errors.
     """
-    local = np.floor((found.placed - found.placed.min(axis=0)) / block_m).astype(np.int64)
-    size = local.max(axis=0) + 1
-    _, block = np.unique(local @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True)
+    _, block = np.unique(cell_numbers(found.placed, block_m), return_inverse=True)
     pulls = system.weighted * found.distance[:, None]
     sums = np.stack([np.bincount(block, column) for column in pulls.T], axis=1)
     single = pulls.T @ pulls
