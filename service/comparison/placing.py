@@ -119,7 +119,10 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
         turn[3:, :3] = np.cross(np.eye(3), by_datum.pivot - last.pivot).T
         open_still = by_datum.open_still @ turn
         last = by_datum._replace(covariance=by_datum.covariance + open_still @ last.covariance @ open_still.T)
-    return Placement(last.pose, last.pivot, last.covariance, rivals, last.held, _along_normals(design, scan, drawn[:SOME], last, reach_m))
+    near, _ = _matched(design, scan, drawn[:SOME], last.pose, reach_m)
+    moves = gradient(near.at, near.across, last.pivot)
+    sigma_m = float(np.sqrt(np.einsum("ni,ij,nj->n", moves, last.covariance, moves).max(initial=0)))
+    return Placement(last.pose, last.pivot, last.covariance, rivals, last.held, sigma_m)
 
 
 def _searched(design: Design, scan: ScannedSurface, drawn: np.ndarray, coarse: float) -> tuple[list[tuple[np.ndarray, float]], np.ndarray]:
@@ -267,12 +270,6 @@ def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarra
 def gradient(points: np.ndarray, across: np.ndarray, pivot: np.ndarray) -> np.ndarray:
     """Return the derivative [n, 6] of the distance of points [n, 3] along unit vectors by a small motion about a pivot."""
     return np.concatenate([np.cross(points - pivot, across), across], axis=1)
-
-
-def _along_normals(design: Design, scan: ScannedSurface, rows: np.ndarray, fit: _Fit, reach: float) -> float:
-    found, _ = _matched(design, scan, rows, fit.pose, reach)
-    moves = gradient(found.at, found.across, fit.pivot)
-    return float(np.sqrt(np.einsum("ni,ij,nj->n", moves, fit.covariance, moves).max(initial=0)))
 
 
 def _share(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float) -> float:
