@@ -133,7 +133,7 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
     _check_unit(measured, nominal)
     if found.evidence is Evidence.DIFFERS:
         turned = compare(second._replace(height=second.height[:, ::-1], variance=second.variance[:, ::-1],
-                                         col=2 * _middle(measured) - second.col - second.height.shape[1] + 1))
+                                         col=second.col - (second.height.shape[1] % 2 == 0)))  # about a middle column
         if turned is not None and turned.correlation >= LEAST_MIRRORED and turned.correlation > found.correlation:
             raise BoardError(f"{nominal.path}: the board is mirrored against it: its mirror image fits (correlation "
                              f"{turned.correlation:.2f}), itself does not ({found.correlation:.2f})")
@@ -211,8 +211,3 @@ def _patch(heights: HeightMap) -> HeightPatch:
     rows, cols = slice(int(row.min()), int(row.max()) + 1), slice(int(col.min()), int(col.max()) + 1)
     floor = np.nanmax(heights.variance) * 1e-6 + 1e-30  # a nominal map may be exact
     return HeightPatch(rows.start, cols.start, heights.height[rows, cols], np.maximum(heights.variance[rows, cols], floor), 1.0)
-
-
-def _middle(heights: HeightMap) -> int:
-    col = np.nonzero(heights.measured)[1]
-    return int(col.min() + col.max()) // 2

@@ -83,12 +83,17 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
     """Inspect a board; nothing is written where tiles or heights do not fit together."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
-    nominal = _nominal(request)
+    nominal = None
+    if request.golden is not None:
+        nominal = read_golden(request.golden, request.regions)
+    elif request.design is not None:
+        nominal = read_design(request.design)
     board = read_tiles(request.board, device=device, cache=request.cache, progress=timings)
     stitched = stitch_board(board, request.pixel_m, request.placement_m, timings)
     if nominal is None:
         timings.stage("blend", len(board.tiles))
-        heights, judged = _levelled(blend(board.tiles, stitched, stitched.grid, progress=timings.advance)), None
+        heights, judged = blend(board.tiles, stitched, stitched.grid, progress=timings.advance), None
+        heights = heights._replace(height=heights.height - fit_form(heights.grid, heights.height, quadratic=False).over(heights.grid))
     else:
         heights, judged = _judge(board, stitched, nominal, request, timings)
     warnings = stitched.warnings + ([] if judged is None else judged.match.warnings)
@@ -124,12 +129,6 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
                               judged.regions, float(judged.inspected.sum() / judged.wanted.sum()), heights, tuple(warnings))
 
 
-def _nominal(request: InspectBoardRequest) -> Nominal | None:
-    if request.golden is not None:
-        return read_golden(request.golden, request.regions)
-    return None if request.design is None else read_design(request.design)
-
-
 def stitch_board(board: BoardTiles, pixel_m: float | None, placement_m: float | None, timings: Timings) -> Stitched:
     """Find where every tile of a board lies; `pixel_m` and `placement_m` as in the request."""
     check_lengths(board, pixel_m=pixel_m, placement_m=placement_m)
@@ -141,11 +140,6 @@ def stitch_board(board: BoardTiles, pixel_m: float | None, placement_m: float | 
         raise BoardError(f"{board.path}: {error}") from error
     timings.advance(REGISTER_STEPS)
     return found
-
-
-def _levelled(heights: HeightMap) -> HeightMap:
-    plane = fit_form(heights.grid, heights.height, quadratic=False)
-    return heights._replace(height=heights.height - plane.over(heights.grid))
 
 
 def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: InspectBoardRequest,

@@ -21,7 +21,7 @@ from service.boards.stitching.blending import TileErrors
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict
 from service.boards.stitching.significance import threshold
-from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend, blend_with_errors
+from service.boards.stitching.stitching import SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched, blend, blended
 from service.boards.tiles import BoardTiles, read_tiles
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -182,8 +182,9 @@ def _placed(board: BoardTiles, stitched: Stitched, pads: list[Pad], request: Ins
         moved = lay(first, openings_of(grid, pads) > 0, stencil_m=request.stencil_m, search_px=search, apart_px=float(apart))
     except BoardError as error:
         raise BoardError(f"{request.paste}: {error}") from error
-    return blend_with_errors(board.tiles, stitched, grid, motion=np.array([*moved, 0.0, 0.0, 0.0, 0.0]),
-                             progress=lambda done: timings.advance(len(board.tiles) + done))
+    sums = blended(board.tiles, stitched, grid, motion=np.array([*moved, 0.0, 0.0, 0.0, 0.0]),
+                   progress=lambda done: timings.advance(len(board.tiles) + done))
+    return sums.result(), sums.errors(stitched.motions)
 
 
 def _datum(paste: Paste, pads: list[Pad], marks: np.ndarray, request: InspectPasteRequest, search_m: float) -> _Marks:

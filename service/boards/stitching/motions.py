@@ -38,13 +38,6 @@ class Motions(NamedTuple):
         return np.asarray(self.covariance[part, part])
 
 
-def displace(x: np.ndarray, y: np.ndarray, z: np.ndarray, motion: np.ndarray, *, centre: tuple[float, float],
-             length_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points in metres after a motion, whose rotation and slopes are small angles."""
-    right, up = (x - centre[0]) / length_m, (y - centre[1]) / length_m
-    return x + motion[0] - motion[2] * up, y + motion[1] + motion[2] * right, z + motion[3] + motion[4] * right + motion[5] * up
-
-
 def solve_motions(overlaps: Mapping[tuple[int, int], Overlap], middles: np.ndarray, *, length_m: float, pixel_m: float,
                   shift_sigma_m: float, turn_sigma: float) -> Motions:
     """Solve for the motion of every tile.

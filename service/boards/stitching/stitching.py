@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from service.boards.stitching.blending import Blender, TileErrors, grid_points
+from service.boards.stitching.blending import Blender, grid_points
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch
-from service.boards.stitching.motions import Motions, displace, solve_motions
+from service.boards.stitching.motions import Motions, solve_motions
 from service.boards.stitching.overlap import UNKNOWNS, Evidence, Overlap, choose_candidate, measure_overlap
 from service.boards.stitching.trends import trend_sentences
 from stage.errors import BoardError
@@ -49,7 +49,8 @@ class TilePoints(NamedTuple):
     def moved(self, motion: np.ndarray, *, centre: tuple[float, float], length_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x, y and z after a motion, [n] float64 metres."""
         x, y, z = (values.astype(np.float64) + start for values, start in zip((self.x, self.y, self.z), self.origin, strict=True))
-        return displace(x, y, z, motion, centre=centre, length_m=length_m)
+        right, up = (x - centre[0]) / length_m, (y - centre[1]) / length_m
+        return x + motion[0] - motion[2] * up, y + motion[1] + motion[2] * right, z + motion[3] + motion[4] * right + motion[5] * up
 
     @property
     def middle(self) -> np.ndarray:
@@ -117,7 +118,9 @@ def stitch(
             if overlap is None or (final and (i, j) in overlaps and overlaps[i, j].evidence is Evidence.DIFFERS):
                 continue
             if flat and overlap.evidence is Evidence.SHIFT:
-                overlap = _without_shift(overlap)
+                information = overlap.information.copy()
+                information[:3], information[:, :3] = 0, 0
+                overlap = overlap._replace(evidence=Evidence.FLAT, information=information)
             found[i, j] = overlap._replace(difference=overlap.difference + motions.values[i] - motions.values[j])
         overlaps = found if not final else {**{pair: o for pair, o in overlaps.items() if o.evidence is Evidence.DIFFERS}, **found}
         _check_agreement(tiles, overlaps, patches, motions, grid, centre, length, shift_sigma, search)
@@ -137,18 +140,12 @@ def stitch(
 def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
           relief: np.ndarray | None = None, progress: Callable[[int], None] = lambda done: None) -> HeightMap:
     """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none. `relief`: as in Blender."""
-    return _blended(tiles, stitched, grid, motion, relief, progress).result()
+    return blended(tiles, stitched, grid, motion=motion, relief=relief, progress=progress).result()
 
 
-def blend_with_errors(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray,
-                      progress: Callable[[int], None] = lambda done: None) -> tuple[HeightMap, TileErrors]:
-    """Return what `blend` does, and the errors of the tiles."""
-    blender = _blended(tiles, stitched, grid, motion, None, progress)
-    return blender.result(), blender.errors(stitched.motions)
-
-
-def _blended(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, motion: np.ndarray | None, relief: np.ndarray | None,
-             progress: Callable[[int], None]) -> Blender:
+def blended(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
+            relief: np.ndarray | None = None, progress: Callable[[int], None]) -> Blender:
+    """Return the sums of all tiles, which have their errors too; arguments are those of `blend`."""
     blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m, relief=relief)
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
@@ -263,12 +260,6 @@ def _tile_noise(overlaps: dict[tuple[int, int], Overlap], count: int, noise: flo
     quietest = min(factors.values(), default=1.0)
     own = [min((factor for pair, factor in factors.items() if tile in pair), default=quietest) for tile in range(count)]
     return np.maximum(noise, np.sqrt(2 * np.square(own) - quietest**2))
-
-
-def _without_shift(overlap: Overlap) -> Overlap:
-    information = overlap.information.copy()
-    information[:3], information[:, :3] = 0, 0
-    return overlap._replace(evidence=Evidence.FLAT, information=information)
 
 
 def _far(tiles: Sequence[TilePoints], motions: Motions, middles: np.ndarray, shift_sigma_m: float) -> list[str]:
