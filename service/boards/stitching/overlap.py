@@ -244,7 +244,7 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     moved[0] -= shift[1] * grid.pixel_m
     moved[1] += shift[0] * grid.pixel_m
     flat = [without_plane(values[both], x, y) for values in (common.first, common.second)]
-    spread = [robust_range(values) for values in flat]
+    spread = [float(np.ptp(np.percentile(values, [2, 98]))) / 4.1 for values in flat]  # σ of a normal distribution within 3 %
     noises = [float(np.sqrt(np.median(patch.variance[patch.measured]) * patch.noise_share)) for patch in (first, second)]
     clipped = [np.clip(values, *np.percentile(values, [0.5, 99.5])) for values in flat]
     deviation = [float(values.std()) for values in clipped]
@@ -265,12 +265,6 @@ def _directions(information: np.ndarray, spurious: float) -> np.ndarray:
     values, vectors = np.linalg.eigh(information[:2, :2])
     kept = vectors[:, values > CLEAR_DIRECTION * spurious]
     return np.asarray(kept @ kept.T)
-
-
-def robust_range(values: np.ndarray) -> float:
-    """Return a quarter of the span from the 2nd to the 98th percentile, which is σ of a normal distribution within 3 %."""
-    low, high = np.percentile(values, [2, 98])
-    return float(high - low) / 4.1
 
 
 def _shared(field: np.ndarray, variance: float) -> float:

@@ -111,7 +111,9 @@ def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float, l
     where, inside = pixels_of(region, deviation.grid)
     part = deviation.cut(where)
     mean, count = mean_of(part, inside), int(inside.sum())
-    if mean is None or mean.pixels < least * expected_pixels(region, deviation.grid):
+    width, height = region.size_m  # without the border of the grid
+    expected = width * height * (np.pi / 4 if region.shape == "circle" else 1.0) / deviation.grid.pixel_m**2 * 0.9
+    if mean is None or mean.pixels < least * max(expected, 1.0):
         return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, 0 if mean is None else mean.pixels)
     value, sigma = mean.value, mean.sigma
     if region.datum == "surround":
@@ -122,9 +124,3 @@ def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float, l
             return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, mean.pixels)
         value, sigma = value - datum.value, float(np.hypot(sigma, datum.sigma))
     return RegionResult(region, Verdict.of(value, sigma, region.tolerance_m, k), value, sigma, count, mean.pixels)
-
-
-def expected_pixels(region: Region, grid: BoardGrid) -> float:
-    """Return how many pixels a region has where the grid has no border."""
-    width, height = region.size_m
-    return max(width * height * (np.pi / 4 if region.shape == "circle" else 1.0) / grid.pixel_m**2 * 0.9, 1.0)

@@ -12,7 +12,6 @@ size is tested against the spread and middle that its own windows have (the empi
 hypothesis testing", JASA 2004).
 """
 
-from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -126,9 +125,11 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
         if side == sides[0]:
             mean_sigma = _nearest(sigma, side)
             findable = _nearest(allowed + (limit + POWER) * wide, side)
-        score = np.fmax(score, _centred(beyond, side, shape))
+        score = np.fmax(score, _centred(beyond, side))
         for sign in (1, -1):
-            found[_covered((beyond >= limit) & (sign * value > 0), side, shape) & (found == 0)] = sign * side
+            significant = (beyond >= limit) & (sign * value > 0)
+            if significant.any():
+                found[(_sums(np.pad(significant, side - 1), side) > 0.5) & (found == 0)] = sign * side  # all that the windows cover
     return Scan(found != 0, found, mean_sigma, findable, score, sides, tests, limit, spread, detectable)
 
 
@@ -211,27 +212,16 @@ def _sums(values: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(whole[side:, side:] - whole[:-side, side:] - whole[side:, :-side] + whole[:-side, :-side])
 
 
-def _centred(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray:
+def _centred(windows: np.ndarray, side: int) -> np.ndarray:
     """Return values of windows at their middle pixels, [rows, cols]; NaN where the window does not fit."""
-    out = np.full(shape, np.nan)
     first = (side - 1) // 2
-    out[first : first + windows.shape[0], first : first + windows.shape[1]] = windows
-    return out
+    return np.pad(windows, ((first, side - 1 - first),) * 2, constant_values=np.nan)
 
 
 def _nearest(windows: np.ndarray, side: int) -> np.ndarray:
     """Return values of windows at their middle pixels, and of the outermost windows from there to the border, [rows, cols]."""
     first = (side - 1) // 2
     return np.pad(windows, ((first, side - 1 - first),) * 2, mode="edge")
-
-
-def _covered(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray:
-    """Return the pixels that any of the marked windows covers, [rows, cols] bool."""
-    if not windows.any():
-        return np.zeros(shape, dtype=bool)
-    padded = np.zeros((shape[0] + side - 1, shape[1] + side - 1))
-    padded[side - 1 : side - 1 + windows.shape[0], side - 1 : side - 1 + windows.shape[1]] = windows
-    return _sums(padded, side)[: shape[0], : shape[1]] > 0.5
 
 
 def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[float, float]) -> HeightMap:
