@@ -98,9 +98,7 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
         row = (three_numbers(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
         return MeasuredLight(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
 
-    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=True),
-                                 drop_failed=request.drop_failed)
-    results = with_wide_spots(results)
+    results = with_wide_spots(_measure_each(captures, [view], measure, timings, mirrors=True, drop_failed=request.drop_failed))
     timings.close()
     return write_lights("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
                         summary={"balls": [ball_entry(ball)]}, warnings=[*warnings, *at_one_place(captures, results)])
@@ -136,10 +134,8 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         row = (three_numbers(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
         return MeasuredLight(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
 
-    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings, mirrors=True),
-                                 drop_failed=request.drop_failed)
+    results = as_unsure_as_rays_miss(_measure_each(captures, views, measure, timings, mirrors=True, drop_failed=request.drop_failed))
     timings.close()
-    results = as_unsure_as_rays_miss(results)
     missing = missing_sentence(results)
     if not named and missing:
         raise CalibrationError(f"{captures.source.folder}: the reflections in the {len(balls)} round outlines that were found do not meet "
@@ -211,8 +207,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
                   "dark_side": None if room is None else round(room, 4), "flags": flags}
         return MeasuredLight(with_brightness(light, scale), entry, (), found.residual)
 
-    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings, mirrors=False),
-                                 drop_failed=request.drop_failed)
+    results = _measure_each(captures, [view], measure, timings, mirrors=False, drop_failed=request.drop_failed)
     timings.close()
     results, said = with_beside(captures, results)
     told = [result.entry for result in results if result.light is not None and result.entry["dark_side"] is not None]
@@ -228,8 +223,8 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],
                   measure: Callable[[LitFrame, Sequence[BallPixels]], MeasuredLight],
-                  timings: Timings, *, mirrors: bool) -> list[MeasuredLight | CalibrationError]:
-    """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured.
+                  timings: Timings, *, mirrors: bool, drop_failed: bool) -> list[MeasuredLight]:
+    """Measure the light of every lit frame; one that cannot be measured is left out as `leave_out_failures` does.
     `mirrors`: whether the balls show the room, of which the patches then say what stands still."""
     correction = Correction.of(captures.source, full_scale=not mirrors)
     still = still_on(captures, correction, views) if mirrors else [None] * len(views)
@@ -244,12 +239,12 @@ def _measure_each(captures: LightCaptures, views: Sequence[BallView],
             return error
 
     timings.stage("frames", len(captures.lit))
-    results = []
+    results: list[MeasuredLight | CalibrationError] = []
     with ThreadPoolExecutor(min(READERS, os.cpu_count() or 1), thread_name_prefix="relit-calibrate") as pool:
         for result in pool.map(one, captures.lit):
             results.append(result)
             timings.advance(len(results))
-    return results
+    return leave_out_failures(captures, results, drop_failed=drop_failed)
 
 
 def _targets(captures: LightCaptures) -> dict[int, SingleLight]:

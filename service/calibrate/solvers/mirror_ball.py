@@ -122,7 +122,9 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     direction, size = _seen_at(view, regions.spot, weight)
     point = weight @ view.point[regions.spot]
     outward = point - ball.centre
-    sure_to = _uncertainty_degrees(ball, cosine, count)
+    # a pixel is uniform over its width; its shift rotates the normal by 1/(radius_px · cosine) radians, and the direction by twice that
+    shift_px = math.sqrt(1 / (12 * count) + ball.outline_error_px**2)
+    sure_to = math.degrees(2 * shift_px / (ball.radius_px * cosine))
     several = regions.share > RIVAL_SHARE
     if several and value[regions.rival].max() > RIVAL_PEAK * value.max():
         light = regions.rise[regions.rival]
@@ -156,15 +158,6 @@ def still_light(radiances: Sequence[np.ndarray], saturated: Sequence[np.ndarray 
 def reflect(to_viewer: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the mirror direction 2(n·v)n - v, [..., 3]: from the ball to the object that the mirror shows at the viewer."""
     return 2 * (normal * to_viewer).sum(axis=-1, keepdims=True) * normal - to_viewer
-
-
-def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
-    """Return the uncertainty of a centroid of `count` pixels: a pixel is uniform over its width, 1/√12, and the outline has an error.
-
-    A shift of one pixel rotates the normal by 1/(radius_px · cosine) radians, and the reflected direction by twice that.
-    """
-    shift_px = math.sqrt(1 / (12 * count) + ball.outline_error_px**2)
-    return math.degrees(2 * shift_px / (ball.radius_px * cosine))
 
 
 def _noise_ceiling(values: np.ndarray) -> float:

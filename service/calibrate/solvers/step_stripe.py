@@ -89,14 +89,10 @@ def split_stripe(
     if np.median(offset) < LEAST_OFFSET_PX * pixel:
         return None
     risers = [_riser(points, order, members[base], members[top], lines[base], lines[top], tolerance, side) for side in (-1, 1)]
-    side = -1 if _count(risers[0]) >= _count(risers[1]) else 1
-    chosen = risers[0] if side < 0 else risers[1]
+    before, behind = (0 if riser is None else len(riser) for riser in risers)
+    side, chosen = (-1, risers[0]) if before >= behind else (1, risers[1])
     return StepStripe(_segment(points[members[base]], noise), _segment(points[members[top]], noise),
                       None if chosen is None else _segment(chosen, noise), side)
-
-
-def _count(points: np.ndarray | None) -> int:
-    return 0 if points is None else len(points)
 
 
 def best_line(points: np.ndarray, tolerance: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
