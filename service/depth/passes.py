@@ -10,7 +10,6 @@ Source: Skaloud and Lichti, "Rigorous approach to bore-sight self-calibration in
 the mounting by planes that are seen from several poses.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -131,19 +130,16 @@ def _apart(planes: _Planes, points: np.ndarray) -> tuple[float, float]:
 
 def _declared_otherwise(shots: Shots, index: np.ndarray, range_m: np.ndarray, least: float) -> str:
     """Return a clause about angles, ranges or poses whose unit, sign or sense is another, by which the passes meet best; none: empty."""
-    trials: dict[str, Callable[[Shots], Shots]] = {
-        "azimuth_rad is in degrees": lambda given: replace(given, azimuth_rad=np.radians(given.azimuth_rad)),
-        "azimuth_rad has the other sign": lambda given: replace(given, azimuth_rad=-given.azimuth_rad),
-        "elevation_rad has the other sign": lambda given: replace(given, elevation_rad=-given.elevation_rad),
-        "the poses are platform_from_world": _inverted,
-    }
     best, clause = EXPLAINED * least, ""
-    for name, change in trials.items():
-        score = _score(change(shots), index, range_m)
+    for name, otherwise, ranges in (
+            ("azimuth_rad is in degrees", replace(shots, azimuth_rad=np.radians(shots.azimuth_rad)), range_m),
+            ("azimuth_rad has the other sign", replace(shots, azimuth_rad=-shots.azimuth_rad), range_m),
+            ("elevation_rad has the other sign", replace(shots, elevation_rad=-shots.elevation_rad), range_m),
+            ("the poses are platform_from_world", _inverted(shots), range_m),
+            ("range_m is in millimetres", shots, range_m / 1000)):
+        score = _score(otherwise, index, ranges)
         if score < best:
             best, clause = score, name
-    if _score(shots, index, range_m / 1000) < best:
-        clause = "range_m is in millimetres"
     return f"they meet if {clause}" if clause else ""
 
 
