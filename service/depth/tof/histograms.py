@@ -181,8 +181,7 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     sure = (solved & usable & (confidence >= LEAST_CONFIDENCE)).reshape(rows, cols)
     wrong = turned_inside_out(range_m, start_m + end_m - range_m, photons.reshape(rows, cols), sure, rays, repeat_m=start_m + end_m,
                               reversal=BINS)
-    if wrong is None:
-        wrong = beyond_span(range_m, sure, nearest_m=start_m, repeat_m=end_m - start_m, why=HISTOGRAM_REPEATS)
+    wrong = wrong or beyond_span(range_m, sure, nearest_m=start_m, repeat_m=end_m - start_m, why=HISTOGRAM_REPEATS)
     if wrong is not None:
         confidence = confidence * DOUBTED
         warnings.append(wrong)

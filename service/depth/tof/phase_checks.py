@@ -48,10 +48,9 @@ that tell it. Bowls and hollows with bright paint have 0.45 of lawful blocks at 
 UNFIT_TIMES, UNFIT_PART = 4.0, 0.2
 """Variance that the wave of a frequency leaves of its images, over that of their neighbours in a row, and its root over the amplitude, from
 which on an image is not that of its phase."""
-UNFIT_SIGMAS, UNFIT_PIXEL, UNFIT_SHARE = 6.0, 0.1, 0.01
+UNFIT_SIGMAS, UNFIT_PIXEL = 6.0, 0.1
 """What a wave leaves of the readings of a frequency at a pixel, over its noise and over the amplitude, from which on they are not those
-of one wave, and share of such pixels from which on it is said: 150 right scenes with harmonics of up to 12 % and hot pixels have .003 at
-most."""
+of one wave."""
 END_PART, FEWEST_WRAPPED, WRAPPED_SHARE = 0.03, 20, 1e-4
 """Largest distance of neighbours over an end of the span, as a part of it, and number of such neighbours and their share of the pixels,
 from which on a surface runs on behind the span."""
@@ -254,13 +253,6 @@ def unfitting_pixels(found: Correlation, noise: Noise, pixels: int) -> np.ndarra
     variance = noise.read**2 + noise.shot * np.maximum(offset, 0)
     least = np.maximum(UNFIT_SIGMAS**2 * variance, (UNFIT_PIXEL * amplitude) ** 2)
     return np.asarray(((freedom > 0) & (residual > freedom * least)).any(axis=0))
-
-
-def unfitting_share(part: float) -> str | None:
-    """Return what a part of the pixels whose readings are no wave says, as a sentence; None where they are few."""
-    return None if part < UNFIT_SHARE else (
-        f"frames[].tof: at {100 * part:.2g} % of the pixels the images of a frequency are no wave over their phases, as where rows of an "
-        "image were lost, or something moved between two: these are unsure")
 
 
 def beyond_span(range_m: np.ndarray, sure: np.ndarray, *, nearest_m: float, repeat_m: float, why: tuple[str, str] = PHASES_REPEAT
