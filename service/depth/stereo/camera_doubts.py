@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.depth.base.epipolar import UNSEEN, Contradiction, contradiction, difference, places_aside
+from service.depth.base.epipolar import Contradiction, contradiction, difference, places_aside
 from service.depth.stereo.rectification import Rectification
 from service.depth.stereo.row_offsets import RowOffsets
 from stage.capture.camera import Camera, OtherCamera
@@ -66,13 +66,6 @@ def unexplained_px(offsets: RowOffsets) -> float:
     return float(np.sqrt(max(np.average(square, weights=[len(part) for part in parts]), 0.0)))
 
 
-def unexplained_sentence(name: str, size_px: float) -> str:
-    """Return what is said of rows that lie apart as no turn and focal length of a camera explains. `name`: the field and its name."""
-    return (f"{name}: the rows of places that both cameras see lie {size_px:.2g} px apart over whole parts of the image, which no turn and "
-            "no focal length explains: check distortion and principal_px of both cameras, and whether they are those of these images; the "
-            "standard deviations hold as much along the rows")
-
-
 def by_chance(offsets: RowOffsets) -> bool:
     """Return whether places match by chance, so that the offsets of neighbours, which follow each other along the rows, differ."""
     return len(offsets.offset) >= ENOUGH and float(np.median(np.abs(np.diff(offsets.offset)))) > CHANCE_PX
@@ -86,12 +79,6 @@ def widened(depth: np.ndarray, sigma: np.ndarray, camera: Camera, found: Contrad
     wider = sigma.copy()
     wider[known] = np.hypot(sigma[known], found.error(camera.points(-depth)[known], given=given))
     return wider
-
-
-def widened_along(depth: np.ndarray, sigma: np.ndarray, geometry: Rectification, size_px: float) -> np.ndarray:
-    """Return the standard deviations of depths where places lie aside along the rows as far as what lines do not show may be.
-    `depth`, `sigma`: [rows, cols] metres, 0 where there is no depth. `size_px`: how far they lie aside across the rows."""
-    return np.asarray(np.hypot(sigma, UNSEEN * size_px * depth**2 / (geometry.focal_px * geometry.baseline_m)), np.float32)
 
 
 def sentence(name: str, found: Contradiction, given: Projector, camera: Camera) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.base.epipolar import VIEW, Contradiction, settled, view_facts
+from service.depth.base.epipolar import UNSEEN, VIEW, Contradiction, settled, view_facts
 from service.depth.base.solution import DepthSolution, statistics
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.patterns.readings import full_scale
@@ -24,9 +24,7 @@ from service.depth.stereo.camera_doubts import (
     contradicted,
     sentence,
     unexplained_px,
-    unexplained_sentence,
     widened,
-    widened_along,
 )
 from service.depth.stereo.rectification import Rectification, RectifiedFrames, pose_of, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import (
@@ -157,8 +155,12 @@ def _measured(capture: Capture, frames: list[Frame], index: int, request: DepthR
     elif len(offsets.offset) >= ENOUGH and (unexplained := unexplained_px(offsets)) > UNEXPLAINED_PX:
         facts["unexplained_px"] = _short(unexplained)
         if unexplained > SAID_PX:
-            warnings.append(unexplained_sentence(f"other_cameras[{index}], {other.name}", unexplained))
-        pair = pair._replace(sigma=widened_along(pair.depth, pair.sigma, geometry, unexplained))
+            warnings.append(f"other_cameras[{index}], {other.name}: the rows of places that both cameras see lie {unexplained:.2g} px "
+                            "apart over whole parts of the image, which no turn and no focal length explains: check distortion and "
+                            "principal_px of both cameras, and whether they are those of these images; the standard deviations hold as "
+                            "much along the rows")
+        aside = UNSEEN * unexplained * pair.depth**2 / (geometry.focal_px * geometry.baseline_m)  # what lines do not show may be as far off
+        pair = pair._replace(sigma=np.asarray(np.hypot(pair.sigma, aside), np.float32))
     if not believed and request.least_confidence is None:
         pair = pair._replace(status=np.where(np.isin(pair.status, SOLVED), np.uint8(Status.UNSURE), pair.status))
     return Measured(pair, facts, warnings)
@@ -271,20 +273,14 @@ def _joined(found: list[PairDepth], frames: list[Frame], capture: Capture, mask:
         sure = np.where(agree, np.maximum(sure, other.sure), np.where(taken, other.sure, sure))
         status = np.where(taken, other.status, np.where(both & ~agree, np.uint8(Status.UNSURE), status))
     status = np.where(mask, status, np.uint8(Status.UNSOLVED)).astype(np.uint8)
-    kept = np.isin(status, ESTIMATED)
+    kept, correction = np.isin(status, ESTIMATED), Correction.of(capture)
     solution = DepthSolution(method="stereo", depth=np.where(kept, depth, 0).astype(np.float32), status=status,
                              sigma=np.where(kept, sigma, 0).astype(np.float32), amplitude=best.contrast,
-                             colour=_scene_colour(frames, capture))
+                             colour=np.asarray(sum(correction.apply(frame).pixels for frame in frames) / len(frames)))
     confidence = solution.confidence_map()
     assert confidence is not None  # it follows from sigma
     solution.confidence = (confidence * np.where(status == Status.UNSURE, DOUBTED, 1.0) * sure).astype(np.float32)
     return solution
-
-
-def _scene_colour(frames: list[Frame], capture: Capture) -> np.ndarray:
-    """Return the mean of the frames of the camera, [rows, cols, 3] linear: many patterns together light a scene evenly."""
-    correction = Correction.of(capture)
-    return np.asarray(sum(correction.apply(frame).pixels for frame in frames) / len(frames))
 
 
 def _chance(solution: DepthSolution, mask: np.ndarray) -> list[str]:
