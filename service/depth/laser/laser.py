@@ -13,7 +13,7 @@ from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
 from service.depth.laser.missed_planes import missed_sentence, missteps, widen_missed
 from service.depth.laser.spot import find_spot, nearest_points
-from service.depth.laser.steady import Moves, widen_moved
+from service.depth.laser.steady import Moves
 from service.depth.laser.stripe_curves import WHOLE
 from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
 from service.depth.laser.stripes import CLEAR_SIGMAS, Sweep, along_of, compare_sweeps, measure_stripe, stripe_signal, unconfirmed
@@ -94,7 +94,8 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         stripes = [along_of(frame.laser) for frame in frames if isinstance(frame.laser, LaserPlane)]
         for along in samples:
             own = moved[np.array(stripes) == along]
-            samples[along] = widen_moved(samples[along], _planes(capture, along), own, camera, along=along)
+            samples[along] = [part.widened(part.depth_change(plane, camera, along=along, across=across, down=down))
+                              for part, plane, (across, down) in zip(samples[along], _planes(capture, along), own, strict=True)]
     said = []
     for along in samples:
         steps = missteps(samples[along], planes := _planes(capture, along), camera, along=along)

@@ -73,13 +73,14 @@ def find_spot(signal: np.ndarray) -> Spot:
         return none
     top, left = max(row - REACH_PX, 0), max(col - REACH_PX, 0)
     window = values[top:row + REACH_PX + 1, left:col + REACH_PX + 1]
-    near = window[max(row - top - 1, 0):row - top + 2, max(col - left - 1, 0):col - left + 2]
-    peak = float(near.max())
+    near = slice(max(row - top - 1, 0), row - top + 2), slice(max(col - left - 1, 0), col - left + 2)
+    peak = float(window[near].max())
     if peak < NOISE_FACTOR * noise:
         return none
     # at least two noises above nothing, so that the spot does not run out into the noise
     floor = max(LEVEL * peak, 2 * noise)
-    inside = _hanging_together(window > floor, row - top, col - left)
+    parts, _ = label(window > floor, np.ones((3, 3)))
+    inside = np.isin(parts, parts[near][parts[near] > 0])
     weight = np.where(inside, window - floor, 0).astype(np.float64)
     total = weight.sum()
     if total <= 0:
@@ -153,10 +154,3 @@ def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: n
 def _blurred(values: np.ndarray) -> np.ndarray:
     """Return the mean of 3×3 pixels, with zeros outside: it lowers a hot pixel below a spot."""
     return np.asarray(uniform_filter(values, 3, mode="constant"))
-
-
-def _hanging_together(above: np.ndarray, row: int, col: int) -> np.ndarray:
-    """Return the connected part of a mask that contains a place or one of its neighbours; pixels that touch at a corner are connected."""
-    parts, _ = label(above, np.ones((3, 3)))
-    near = parts[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]
-    return np.isin(parts, near[near > 0])

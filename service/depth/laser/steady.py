@@ -4,15 +4,10 @@ A frame that is moved by d shows ambient(p - d) in place of ambient(p), so that 
 linear step of Lucas and Kanade, "An iterative image registration technique", IJCAI 1981). Two halves of the places are asked apart.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.ndimage import maximum_filter, shift
 
-from service.depth.laser.stripe_map import StripeSamples
 from service.depth.laser.stripes import Signal
-from stage.capture.camera import Camera
-from stage.capture.light import LaserPlane
 
 BLOCK = 2
 """Side in pixels of the blocks whose means are compared."""
@@ -87,10 +82,3 @@ def _blocks(image: np.ndarray) -> np.ndarray:
     """Return the means of whole blocks of an image, [rows, cols]."""
     rows, cols = (size // BLOCK for size in image.shape)
     return np.asarray(image[:rows * BLOCK, :cols * BLOCK].reshape(rows, BLOCK, cols, BLOCK).mean(axis=(1, 3), dtype=np.float32))
-
-
-def widen_moved(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], moves: np.ndarray, camera: Camera, *,
-                along: str) -> list[StripeSamples]:
-    """Add to the deviations of each frame's samples what its move, [frames, 2] pixels across and down, makes of their depths."""
-    return [part.widened(part.depth_change(plane, camera, along=along, across=across, down=down))
-            for part, plane, (across, down) in zip(samples, planes, moves, strict=True)]

@@ -85,11 +85,11 @@ def _differences(collected: Collected, grey: np.ndarray, variance: np.ndarray) -
 
 def _factor(apart: np.ndarray, expected: np.ndarray, alike: np.ndarray) -> float | None:
     """Return by how much second differences along the last axis spread more than expected; None of too few."""
-    def three(values: np.ndarray, sides: float, middle: float) -> np.ndarray:
-        return np.asarray(sides * (values[..., :-2] + values[..., 2:]) + middle * values[..., 1:-1])
+    def three(values: np.ndarray, middle: float) -> np.ndarray:
+        return np.asarray(values[..., :-2] + values[..., 2:] + middle * values[..., 1:-1])
 
     compared = (alike[..., 1:-1] > 0) & (alike[..., :-2] == alike[..., 1:-1]) & (alike[..., 2:] == alike[..., 1:-1])
     if compared.sum() < ENOUGH:
         return None
-    bend, spread = three(apart, 1, -2), three(expected, 1, 4)
+    bend, spread = three(apart, -2), three(expected, 4)
     return float(MAD_TO_SIGMA * np.median(np.abs(bend[compared]) / np.sqrt(spread[compared])))

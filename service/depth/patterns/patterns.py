@@ -87,7 +87,9 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     missing = missing_calibration(capture)
     projector = check_projector(capture) if missing is None else None
     if missing is not None:
-        _refuse_depth_options(request, missing)
+        for option in ("near_m", "far_m", "max_sigma", "normals", "refine_projector"):
+            if getattr(request, option) not in (None, False):
+                raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
     frames, series = frames_shown(capture)
     shown = pattern_projector(capture, frames)
     codes = read_codes(capture, frames, shown, refine=request.refine)
@@ -152,13 +154,6 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     decoded_only.warnings.insert(0, f"decoded only, without depth: {reason}")
     decoded_only.facts |= facts | {"decoded_only": reason}
     return decoded_only
-
-
-def _refuse_depth_options(request: DepthRequest, missing: str) -> None:
-    """Refuse options that say something about depths where there will be none."""
-    for option in ("near_m", "far_m", "max_sigma", "normals", "refine_projector"):
-        if getattr(request, option) not in (None, False):
-            raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
 
 
 def _refused(solution: DepthSolution, mask: np.ndarray) -> str:

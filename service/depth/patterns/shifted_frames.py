@@ -166,14 +166,9 @@ def _usual_step(place: np.ndarray, known: np.ndarray) -> float:
     return float(np.median(np.abs(place[:, AROUND:] - place[:, :-AROUND])[both])) / AROUND if both.any() else 0.0
 
 
-def _both(solved: np.ndarray, along: int) -> np.ndarray:
-    """Return the pairs of neighbours that are both solved."""
-    return np.asarray(solved[1:] & solved[:-1] if along == 0 else solved[:, 1:] & solved[:, :-1])
-
-
 def _slope(axis: AxisMaps, across: int) -> np.ndarray:
     """Return by how many projector pixels places change at a camera pixel, averaged over the pixels around, [rows, cols]."""
-    both = _both(axis.solved, across)
+    both = axis.solved[1:] & axis.solved[:-1] if across == 0 else axis.solved[:, 1:] & axis.solved[:, :-1]
     step = np.where(both, np.diff(axis.coordinate, axis=across), 0)
     usual = float(np.median(np.abs(step[both])))
     summed, count = (uniform_filter(np.pad(each.astype(np.float32), [(0, 1 - across), (0, across)]), OVER) for each in (step, both))
