@@ -115,7 +115,9 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         drifts = [plane.to_heights(to_numpy(integrated(other.astype(np.float32)).height).astype(np.float64), solved) - base
                   for other in turned]
         shift_px = relief_shift_px(u, u_sigma, base, known & (part == largest), part, drifts)
-    shifted = _shifted(base, shift_px)
+    shifted = np.zeros(base.shape)  # by how much heights differ from those that are shifted
+    if any(shift_px):
+        shifted = np.asarray(sum(np.gradient(base, axis=axis) * way for axis, way in zip((1, 0), shift_px, strict=True)))
     u = u + shifted
     for box, here in _parts(part):
         seen = here & known[box]
@@ -151,13 +153,6 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
                   _unexplained(unlike, left), step_m, noise_factor, factor, shift_px,
                   shared_m, one_sided_m, contradicted)
-
-
-def _shifted(base: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
-    """Return by how much heights differ from those that are shifted."""
-    if not any(shift_px):
-        return np.zeros(base.shape)
-    return np.asarray(sum(np.gradient(base, axis=axis) * part for axis, part in zip((1, 0), shift_px, strict=True)))
 
 
 def _variation(values: np.ndarray, sigma: np.ndarray) -> float:

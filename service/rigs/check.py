@@ -33,8 +33,6 @@ class RigCheck(NamedTuple):
     """The number of channels in each."""
     primaries: dict[str, int]
     """The number of lamps that have each primary."""
-    uncovered: float
-    """The part of the sphere in which no lamp stands within their reach, 0…1."""
     faults: tuple[str, ...]
     """What keeps lamps from being driven, as `field: what is wrong`."""
     warnings: tuple[str, ...]
@@ -59,7 +57,7 @@ def check_rig(request: RigCheckRequest) -> RigCheck:
     warnings += _places(rig)
     if request.picture is not None:
         _draw(rig, request.picture)
-    return RigCheck(rig, dict(channels), dict(Counter(primary.name for _, primary in rig.emitters)), uncovered, tuple(patch_faults(rig)),
+    return RigCheck(rig, dict(channels), dict(Counter(primary.name for _, primary in rig.emitters)), tuple(patch_faults(rig)),
                     tuple(warnings))
 
 

@@ -231,7 +231,7 @@ class DepthJoiner:
         return joined, {
             "joined_pixels": int(np.count_nonzero(rest)), "compared_pixels": int(np.count_nonzero(both)),
             "steps_joined": {"median": float(np.median(count)) if len(count) else 0.0, "most": int(count.max(initial=0))},
-            "noise_share": {"depth": float(f"{np.median(share[both]):.4g}") if both.any() else 0.0}}
+            "noise_share": {"depth": _middle(share, both)}}
 
 
 def moved_points(cloud: PointCloud, alone: DepthMaps, joined: DepthMaps) -> PointCloud:
