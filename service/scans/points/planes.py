@@ -26,12 +26,10 @@ def local_planes(points: np.ndarray, *, origin: np.ndarray) -> LocalPlanes:
     middle = np.median(points, axis=0).astype(np.float64) if len(points) else np.zeros(3)
     local = points.astype(np.float64) - middle
     cell = _cell_of(local)
-    index, keys = _cells(local, cell)
+    keys, steps = _cells(local, cell)
     occupied, of_point = np.unique(keys, return_inverse=True)
     moments = _moments(local, of_point, len(occupied))
     around = np.zeros_like(moments)
-    size = index.max(axis=0) + 3 if len(index) else np.ones(3, dtype=np.int64)
-    steps = np.array([1, size[0], size[0] * size[1]])
     for offset in np.ndindex(3, 3, 3):
         there = occupied + int((np.array(offset) - 1) @ steps)
         place = np.minimum(np.searchsorted(occupied, there), max(len(occupied) - 1, 0))
@@ -55,16 +53,17 @@ def _cell_of(local: np.ndarray) -> float:
     extent = float(np.ptp(local, axis=0).max()) if len(local) else 0.0
     cell = max(2 * extent / np.sqrt(max(len(local), 1)), 1e-9 * extent, np.finfo(np.float64).tiny)
     for _ in range(4):
-        held = len(local) / max(len(np.unique(_cells(local, cell)[1])), 1)
+        held = len(local) / max(len(np.unique(_cells(local, cell)[0])), 1)
         cell *= float(np.clip(np.sqrt(POINTS_PER_CELL / max(held, 1.0)), 0.25, 4.0)) if held > 1.01 else 2.0
     return float(cell)
 
 
 def _cells(local: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell of each point, [n, 3] int64 from 1, and its number [n] in a grid with an empty border."""
+    """Return the number of the cell of each point, [n] int64, in a grid with an empty border, and by how much it grows along each axis."""
     index = np.floor((local - local.min(axis=0)) / cell).astype(np.int64) + 1 if len(local) else np.zeros((0, 3), dtype=np.int64)
     size = index.max(axis=0) + 3 if len(index) else np.ones(3, dtype=np.int64)
-    return index, index @ np.array([1, size[0], size[0] * size[1]])
+    steps = np.array([1, size[0], size[0] * size[1]])
+    return index @ steps, steps
 
 
 def _moments(local: np.ndarray, of_point: np.ndarray, count: int) -> np.ndarray:

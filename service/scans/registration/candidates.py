@@ -64,8 +64,7 @@ class Overlaps:
         _, around = self._of(a, side)
         place = np.minimum(np.searchsorted(around, own), len(around) - 1)
         inside = np.count_nonzero(around[place] == own)
-        alike = self._outlines[a].cell_m == self._outlines[b].cell_m
-        return float(inside / (min(len(own), len(self._outlines[a].points)) if alike else len(own)))
+        return float(inside / (min(len(own), len(self._outlines[a].points)) if self.of_one_scale(a, b) else len(own)))
 
     def facing(self, a: int, b: int) -> float:
         """Return about which part of the smaller scan, or of the scan of smaller scale, has surface of the other around it that is turned
@@ -76,7 +75,7 @@ class Overlaps:
         own, around = self._turned(b, side)[0], self._turned(a, side)[1]
         inside = around[np.minimum(np.searchsorted(around, own), len(around) - 1)] == own
         part = inside.reshape(len(own) // 6, 6).any(axis=1).sum()
-        alike = self._outlines[a].cell_m == self._outlines[b].cell_m
+        alike = self.of_one_scale(a, b)
         return float(part / (min(len(self._outlines[number].points) for number in (a, b)) if alike else len(own) // 6))
 
     def _turned(self, number: int, side: float) -> tuple[np.ndarray, np.ndarray]:

@@ -137,14 +137,11 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
             pairs |= found
             solved, kept = solve_all()
         told = any(pair.fit is not None for pair in targeted.values()) or started  # by what tells a body from its turned self
-        wrong = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and count <= ALL_PAIRS and not told else {}
-        if wrong:
-            pairs |= wrong
-            solved, kept = solve_all()
-            continue
-        undecided = open_pairs(solved.poses, [*pairs.values()], len(cells)) if solved is not None and not options.accept_alike else {}
-        if undecided:
-            pairs |= undecided
+        doubted = wrongly_joined(solved.poses, kept, work.ready) if solved is not None and count <= ALL_PAIRS and not told else {}
+        if not doubted and solved is not None and not options.accept_alike:
+            doubted = open_pairs(solved.poses, [*pairs.values()], len(cells))
+        if doubted:
+            pairs |= doubted
             solved, kept = solve_all()
             continue
         further = most_alike(unlike, _groups(count, [*pairs.values(), *targeted.values()]))
