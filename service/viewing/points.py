@@ -7,7 +7,6 @@ import numpy as np
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import step_within
 from service.viewing.result_layers import ResultLayers
-from stage.capture.camera import Camera
 from stage.colour.colour import convert
 from stage.formats.ply import POINTS_FILE, read_ply
 
@@ -29,19 +28,11 @@ def write_points(found: ResultLayers, file: BlockFile) -> dict[str, Any]:
     colours = _colours(found, chosen)
     return {
         "count": len(pixels), "unsure": len(unsure), "step": step,
-        "positions": file.append(camera_points(found.camera, chosen, depth)),
+        "positions": file.append(found.camera.points_at(chosen, -depth)),
         "colours": None if colours is None else file.append(colours),
         "depth": file.append(depth),
         "confidence": file.append(np.rint(255 * np.clip(confidence.astype(np.float32), 0, 1)).astype(np.uint8)),
     }
-
-
-def camera_points(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return [n, 3] float32 camera-frame places of pixels [n], row-major positions, with a depth [n]."""
-    row, col = np.divmod(pixels, camera.width)
-    x, y = camera.plane_at(col + 0.5, row + 0.5)
-    spread = depth.astype(np.float64) if camera.projection == "perspective" else 1.0
-    return np.stack([x * spread, y * spread, -depth], axis=1).astype(np.float32)
 
 
 def _every(mask: np.ndarray, step: int) -> np.ndarray:

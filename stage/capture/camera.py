@@ -172,11 +172,16 @@ class Camera(Strict):
         [rows, cols, 3] float32, in the unit of `height`."""
         return self._raised(*self.plane_views(first_row, len(height)), height)
 
+    def points_over(self, u: np.ndarray, v: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """Return the camera-frame points that the camera sees at image coordinates, as `points` does.
+        `u`, `v`: as of `plane_at`. `height`: [...] camera-frame z. Returns [..., 3] float32, in the unit of `height`."""
+        return self._raised(*self.plane_at(u, v), height)
+
     def points_at(self, pixels: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return the camera-frame points of single pixels, as `points` does.
         `pixels`: [n] row-major positions in the image. `height`: [n] camera-frame z. Returns [n, 3] float32, in the unit of `height`."""
         row, col = np.divmod(pixels, self.width)
-        return self._raised(*self.plane_at(col + 0.5, row + 0.5), height)
+        return self.points_over(col + 0.5, row + 0.5, height)
 
     def _raised(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> np.ndarray:
         if self.projection == "perspective":

@@ -104,9 +104,7 @@ def _of_cloud(maps: DepthMaps, cloud: PointCloud) -> MeasuredPoints:
     if maps.camera.projection == "perspective":
         seen &= cloud.points[:, 2] < 0
     points = cloud.points[seen]
-    cols, rows = (np.floor(place).astype(np.int64) for place in maps.camera.image_coordinates(points))
-    inside = (rows >= 0) & (rows < maps.camera.height) & (cols >= 0) & (cols < maps.camera.width)
-    rows, cols = np.where(inside, rows, 0), np.where(inside, cols, 0)
+    rows, cols, inside = maps.camera.pixels_of(points)
     depth = maps.depth[rows, cols]
     agree = np.count_nonzero(inside & maps.mask[rows, cols] & (np.abs(depth + points[:, 2]) <= SAME_DEPTH * np.abs(depth)))
     if agree < LEAST_AGREEMENT * len(cloud.points) or (len(cloud.points) == 0 and maps.mask.any()):

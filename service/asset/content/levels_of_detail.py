@@ -12,7 +12,7 @@ import fast_simplification
 import numpy as np
 
 from service.asset.content.links import drawn_apart, height_of, joined, relief, split_fans
-from service.asset.content.mesh import SurfaceMesh, camera_points, vertex_normals
+from service.asset.content.mesh import SurfaceMesh, vertex_normals
 from stage.capture.camera import Camera
 
 REDUCTION = 4
@@ -133,7 +133,7 @@ def _level(places: np.ndarray, triangles: np.ndarray, mesh: SurfaceMesh, camera:
     used = np.unique(triangles)
     triangles, places = np.searchsorted(used, triangles).astype(np.int32), places[used]
     u, v = places[:, 0], -places[:, 1]
-    points = camera_points(camera, u, v, height_of(places[:, 2], camera))
+    points = camera.points_over(u, v, height_of(places[:, 2], camera))
     st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
     normals = full.at(places, triangles, vertex_normals(points, none, triangles))
     rows, cols = (np.clip(np.floor(place).astype(np.int64), 0, size - 1) for place, size in ((v, camera.height), (u, camera.width)))

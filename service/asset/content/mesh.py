@@ -20,7 +20,6 @@ import numpy as np
 
 from service.asset.content.links import Links, drawn_apart, height_of, relief, split_fans, surface_links, touched, without_islands
 from service.errors import SurfaceError
-from stage.capture.camera import Camera
 from stage.results.depth_breaks import STEEPEST
 from stage.results.maps import SurfaceMaps
 
@@ -93,18 +92,10 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links:
     slope = np.where(faces.weight > 0, np.clip(nearest - other, -STEEPEST, STEEPEST), nearest - other)
     height = np.where(faces.weight == 0, maps.height[rows, cols], height_of(nearest + faces.weight * slope, camera))
     v, u = (faces.pixel + faces.shift + 0.5).T
-    points = camera_points(camera, u, v, height)
+    points = camera.points_over(u, v, height)
     st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
     normals = vertex_normals(points, faces.quads, faces.triangles)
     return SurfaceMesh(points, normals, st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
-
-
-def camera_points(camera: Camera, u: np.ndarray, v: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Return the camera-frame points [n, 3] float32 at image coordinates u and v [n] with these camera-frame z [n]."""
-    x, y = camera.plane_at(u, v)
-    if camera.projection == "perspective":
-        x, y = -x * height, -y * height
-    return np.stack([x, y, height], axis=-1).astype(np.float32)
 
 
 def valid_heights(maps: SurfaceMaps) -> np.ndarray:

@@ -111,9 +111,7 @@ def _define_rectangle(usd_stage: Usd.Stage, path: Sdf.Path, camera: Camera, z: f
     """Define the part of the plane at z that the image shows, with texture coordinates."""
     cells = 1 if camera.distortion is None else CELLS
     u, v = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))
-    x, y = camera.plane_at(u * camera.width, v * camera.height)
-    scale = -z if camera.projection == "perspective" else 1.0
-    points = np.stack([x * scale, y * scale, np.full_like(x, z)], axis=-1).reshape(-1, 3).astype(np.float32)
+    points = camera.points_over(u * camera.width, v * camera.height, np.full_like(u, z)).reshape(-1, 3)
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
     faces = np.stack([corner + cells + 1, corner + cells + 2, corner + 1, corner], axis=1).astype(np.int32)  # anticlockwise from +z
     normals = np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
