@@ -229,9 +229,10 @@ def bleed(
     if not in_place:
         filled = filled.copy()
     rows, cols, channels = filled.shape
-    done, inside = np.pad(known, 1), np.pad(np.ones_like(known), 1)
-    ring = np.argwhere(_dilated(done) & inside & ~done) - 1
+    done = np.pad(known, 1)
+    inner = done[1:-1, 1:-1]
     for _ in range(reach):
+        ring = np.argwhere(_dilated(done)[1:-1, 1:-1] & ~inner)
         if len(ring) == 0:
             break
         total = np.zeros((len(ring), channels), dtype=np.float32)
@@ -242,9 +243,8 @@ def bleed(
             total += np.where(given, filled[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0)
             count += given
         filled[ring[:, 0], ring[:, 1]] = _as_type(total / count, filled.dtype)
-        done[ring[:, 0] + 1, ring[:, 1] + 1] = True
-        ring = _around(ring, done, inside)
-    beyond = ~done[1:-1, 1:-1]
+        inner[ring[:, 0], ring[:, 1]] = True
+    beyond = ~inner
     if beyond.any():
         mean = [filled[..., c].mean(where=known, dtype=np.float64) if known.any() else 0.0 for c in range(channels)]
         filled[beyond] = _as_type(np.array(mean), filled.dtype)
@@ -265,11 +265,3 @@ def _dilated(done: np.ndarray) -> np.ndarray:
     tall[1:] |= wide[:-1]
     tall[:-1] |= wide[1:]
     return tall
-
-
-def _around(texels: np.ndarray, done: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return the texels [n, 2] of the image that touch these and are not done, each once; the masks have a frame of one texel."""
-    touched = np.zeros_like(done)
-    for r, c in _NEIGHBOURS:
-        touched[texels[:, 0] + r + 1, texels[:, 1] + c + 1] = True
-    return np.argwhere(touched & inside & ~done) - 1
