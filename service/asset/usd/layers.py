@@ -169,7 +169,7 @@ class AssetLayers:
         """Let a stage, and the asset that it is a part of, reach from one time code to another, both included."""
         if not self.packed or usd_stage == self._interface:
             self._times += [first, last]
-        _set_times(usd_stage, first, last)
+        set_time_range(usd_stage, first, last)
 
     def save(self) -> None:
         """Bind the looks, write variant sets, extents and times, and save the layers; the object is of no use afterwards."""
@@ -196,7 +196,7 @@ class AssetLayers:
             if variants:
                 root.GetVariantSets().GetVariantSet(variant_set).SetVariantSelection(variants[0])
         if self._times:
-            _set_times(self._interface, min(self._times), max(self._times))
+            set_time_range(self._interface, min(self._times), max(self._times))
         self._interface.Save()
         del self.geometry, self.materials, self._interface
 
@@ -318,11 +318,12 @@ def _in_variant(usd_stage: Usd.Stage, root: Sdf.Path, variant_set: str, name: st
         variants.ClearVariantSelection()
 
 
-def _set_times(usd_stage: Usd.Stage, first: float, last: float) -> None:
+def set_time_range(usd_stage: Usd.Stage, first: float, last: float, frames_per_second: float = FRAME_RATE) -> None:
+    """Let a stage reach from one time code to another, both included."""
     usd_stage.SetStartTimeCode(first)
     usd_stage.SetEndTimeCode(last)
-    usd_stage.SetTimeCodesPerSecond(FRAME_RATE)
-    usd_stage.SetFramesPerSecond(FRAME_RATE)
+    usd_stage.SetTimeCodesPerSecond(frames_per_second)
+    usd_stage.SetFramesPerSecond(frames_per_second)
 
 
 def pose_matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
+from service.asset.usd import layers
 from service.asset.usd.files import write_layer
 from service.asset.usd.layers import CAMERA_FRAME, Description, define_root, describe_root, pose_matrix, prim_name, set_extents_hint
 from service.asset.usd.materials import define_display_color_material
@@ -96,10 +97,7 @@ def _define(usd_stage: Usd.Stage, moments: Iterator[Moment], target: Path, descr
         usd_stage.Save()  # what is saved leaves the memory
     if steps == 0:
         raise AssetError(f"{target}: the sequence has no step")
-    usd_stage.SetStartTimeCode(first)
-    usd_stage.SetEndTimeCode(last)
-    usd_stage.SetTimeCodesPerSecond(frames_per_second)
-    usd_stage.SetFramesPerSecond(frames_per_second)
+    layers.set_time_range(usd_stage, first, last, frames_per_second)
     extent = np.stack([low, high])
     define_cameras(usd_stage, root.GetPath(), description.camera, extent)
     set_extents_hint(root.GetPrim())
