@@ -26,12 +26,12 @@ _HEADER, _CHUNK_HEADER = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BIN = b"JSON", b"BIN\0"
 
-COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-"""Bytes of each type of component (3.6.2.2, "Accessor Data Types")."""
+COMPONENT_TYPES = {code: np.dtype(kind) for code, kind in (
+    (5120, "i1"), (5121, "u1"), (5122, "<i2"), (5123, "<u2"), (5125, "<u4"), (5126, "<f4"))}
+"""The NumPy type of each code of a type of component (3.6.2.2, "Accessor Data Types")."""
 ELEMENT_SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 """Components of each type of element."""
-_COMPONENT_TYPES = {"<u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
-"""The code of each NumPy type that is written."""
+_CODES = {kind: code for code, kind in COMPONENT_TYPES.items()}
 _ELEMENT_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -54,9 +54,8 @@ class Glb:
         values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         components = values.shape[1] if values.ndim == 2 else 1
         least, greatest = (np.atleast_1d(edge).tolist() for edge in (values.min(axis=0), values.max(axis=0))) if bounds else ([], [])
-        kind = _COMPONENT_TYPES[f"<{values.dtype.kind}{values.dtype.itemsize}"]  # single bytes have no order of their own
         self.document.accessors.append(Accessor(
-            bufferView=self._add_part(values, values.nbytes, target), componentType=kind,
+            bufferView=self._add_part(values, values.nbytes, target), componentType=_CODES[values.dtype],
             normalized=False, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
         return len(self.document.accessors) - 1
 

@@ -11,7 +11,7 @@ import numpy as np
 from pygltflib import GLTF2, TRIANGLES, Material
 
 from service.asset.content.surface import length_fault
-from service.asset.gltf.container import ELEMENT_SIZES, GlbContents
+from service.asset.gltf.container import COMPONENT_TYPES, ELEMENT_SIZES, GlbContents
 
 FINITE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD")
 """Attributes that must be numbers; others, as the σ of a depth, may be unknown."""
@@ -20,7 +20,6 @@ DIRECTIONS = ("NORMAL", "TANGENT")
 BOUNDS_TOLERANCE = 1e-4
 """The largest deviation of min and max from the values, as a part of their range: more than decimals of a document round."""
 FLOAT32 = 5126
-TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
 
 def geometry_faults(path: Path, contents: GlbContents) -> Iterator[str]:
@@ -93,7 +92,7 @@ def _values(path: Path, contents: GlbContents, number: int) -> np.ndarray | None
     accessor = contents.document.accessors[number]
     if accessor.bufferView is None or accessor.sparse is not None or not accessor.count:
         return None
-    view, kind = contents.document.bufferViews[accessor.bufferView], np.dtype(TYPES[accessor.componentType])
+    view, kind = contents.document.bufferViews[accessor.bufferView], COMPONENT_TYPES[accessor.componentType]
     if view.buffer or contents.document.buffers[0].uri:
         return None
     stored = np.memmap(path, np.uint8, "r")

@@ -14,7 +14,7 @@ import numpy as np
 from pygltflib import GLTF2, POINTS, TRIANGLES
 
 from service.asset.content.surface import Inspection, Part, image_facts, size_doubts, texture_faults
-from service.asset.gltf.container import COMPONENT_BYTES, ELEMENT_SIZES, GlbContents, read_glb
+from service.asset.gltf.container import COMPONENT_TYPES, ELEMENT_SIZES, GlbContents, read_glb
 from service.asset.gltf.geometry_faults import geometry_faults
 from service.errors import AssetError
 from stage.errors import storage
@@ -125,7 +125,7 @@ def _faults(contents: GlbContents) -> Iterator[str]:
             yield f"bufferView {number} reaches beyond the {contents.data_size} bytes of the buffer"
     for number, accessor in enumerate(document.accessors):
         if accessor.bufferView is not None:
-            element = COMPONENT_BYTES[accessor.componentType] * ELEMENT_SIZES[accessor.type]
+            element = COMPONENT_TYPES[accessor.componentType].itemsize * ELEMENT_SIZES[accessor.type]
             stride = document.bufferViews[accessor.bufferView].byteStride or element
             if (accessor.byteOffset or 0) + stride * (accessor.count - 1) + element > document.bufferViews[accessor.bufferView].byteLength:
                 yield f"accessor {number} reaches beyond its bufferView"
