@@ -10,7 +10,7 @@ import os
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,7 +184,8 @@ def _beneath(confined: Confined, path: Path) -> int:
                 os.close(descriptor)
         raise ManifestError(f"{path}: is no file")
     finally:
-        _close(folders)
+        for descriptor in folders:
+            os.close(descriptor)
 
 
 def _link(name: str, folder: int) -> Path | None:
@@ -193,8 +194,3 @@ def _link(name: str, folder: int) -> Path | None:
         return Path(os.readlink(name, dir_fd=folder))
     except OSError:
         return None
-
-
-def _close(descriptors: Sequence[int]) -> None:
-    for descriptor in descriptors:
-        os.close(descriptor)

@@ -284,8 +284,6 @@ def _nothing_solved(counts: Mapping[str, int], least_confidence: float | None) -
 
 def _count_above_one(solution: Solution, solved: np.ndarray) -> int:
     """Return the number of solved pixels whose albedo is above 1 by more than SURELY_ABOVE of its standard errors."""
-    if solution.albedo is None:
-        return 0
     pixels = np.flatnonzero(solved.reshape(-1) & (solution.albedo > 1).any(axis=0))
     least, sigma = solution.albedo[:, pixels], solution.albedo_sigma(pixels)
     if sigma is not None:

@@ -113,8 +113,6 @@ def _matrix(content: bytes, order: str) -> tuple[str, object]:
         encoded, raw = next(elements)
         encoding = TEXTS[encoded]
         text = raw.decode(encoding if encoding == "utf-8" else f"{encoding}-{'le' if order == '<' else 'be'}")
-        if encoded == 4 and len(text) != int(np.prod(shape)):
-            return name, None
         rows = np.array(list(text)).reshape(shape, order="F") if text and int(np.prod(shape)) == len(text) else None
         return name, tuple("".join(row).rstrip() for row in rows) if rows is not None and rows.ndim == 2 else None
     if not FIRST_NUMBER <= kind <= LAST_NUMBER or flags & COMPLEX:

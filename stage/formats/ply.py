@@ -1,6 +1,6 @@
 """Point clouds as binary PLY files: float32 x y z, uchar red green blue, and what else is known: normals, intensity, σ, confidence."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,7 +77,8 @@ def read_ply(path: str | Path) -> PointCloud:
         lines = start[:max(end, 0)].decode("ascii", "replace").splitlines()
         counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
         names = tuple(line.split()[-1] for line in lines if line.startswith("property "))
-        kind = _type(name for name in (*POSITION, *NORMAL, *COLOUR, *SCALARS) if name in names or name in (*POSITION, *COLOUR))
+        known = [name for name in (*POSITION, *NORMAL, *COLOUR, *SCALARS) if name in names or name in (*POSITION, *COLOUR)]
+        kind = np.dtype([(name, "u1" if name in COLOUR else "<f4") for name in known])
         if lines[:2] != ["ply", "format binary_little_endian 1.0"] or len(counts) != 1 or names != kind.names:
             raise ResultError(f"{path}: is not a point cloud as relit writes it")
         stream.seek(end + len(b"end_header\n"))
@@ -90,7 +91,3 @@ def read_ply(path: str | Path) -> PointCloud:
 
     return PointCloud(columns(POSITION), columns(COLOUR), columns(NORMAL) if NORMAL[0] in names else None,
                       *(values[name] if name in names else None for name in SCALARS))
-
-
-def _type(names: Iterable[str]) -> np.dtype:
-    return np.dtype([(name, "u1" if name in COLOUR else "<f4") for name in names])

@@ -53,7 +53,10 @@ def read_rig(path: Path) -> LightRig:
     """Read the lights of a rig.
     `path`: a .mat file with S (positions) and, if they are known, Dir, Phi and mu; or a .json file with these keys, with `positions`,
     `directions`, `intensities` and `mu`, or with a list `lights` of objects of `position`, `direction`, `intensity`, `mu` and `image`."""
-    fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
+    if path.suffix.lower() == ".mat":
+        fields: dict[str, Any] = {name.rpartition(".")[2].lower(): value for name, value in read_mat_arrays(path).items()}
+    else:
+        fields = _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
     if positions is None:
         raise ManifestError(f"{path}: holds {', '.join(fields) or 'no array'}: there must be positions of the lights, S or positions")
@@ -92,10 +95,6 @@ def read_camera_matrix(path: Path, resolution: tuple[int, int]) -> CameraMatrix:
         raise ManifestError(f"{path}: its principal point is {principal[0]:g}, {principal[1]:g}, outside the images of {width}x{height} "
                             "pixels: it belongs to another resolution")
     return CameraMatrix((float(k[0, 0]), float(k[1, 1])), principal, glass, "1, 1 (MATLAB)" if matlab else "0, 0 (OpenCV)")
-
-
-def _from_mat(path: Path) -> dict[str, Any]:
-    return {name.rpartition(".")[2].lower(): value for name, value in read_mat_arrays(path).items()}
 
 
 def _from_json(path: Path) -> dict[str, Any]:

@@ -29,14 +29,6 @@ UNIVERSES = {"sacn": (1, 63999), "artnet": (0, 32767)}
 ResponsePoint = tuple[Fraction, Fraction]
 
 
-def _rising(points: tuple[ResponsePoint, ...]) -> tuple[ResponsePoint, ...]:
-    if points[0] != (0.0, 0.0) or points[-1] != (1.0, 1.0):
-        raise ValueError("must begin with [0, 0] and end with [1, 1]")
-    if any(after[0] <= before[0] or after[1] < before[1] for before, after in pairwise(points)):
-        raise ValueError("must rise: each drive above the one before, its light not below")
-    return points
-
-
 class Spectrum(Strict):
     """A measured spectrum, linear between its samples and 0 outside of them."""
 
@@ -69,10 +61,10 @@ class Primary(Strict):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.response is not None:
-            try:
-                _rising(self.response)
-            except ValueError as error:
-                raise ValueError(f"response {error}") from error
+            if self.response[0] != (0.0, 0.0) or self.response[-1] != (1.0, 1.0):
+                raise ValueError("response must begin with [0, 0] and end with [1, 1]")
+            if any(after[0] <= before[0] or after[1] < before[1] for before, after in pairwise(self.response)):
+                raise ValueError("response must rise: each drive above the one before, its light not below")
         return self
 
 

@@ -260,7 +260,7 @@ def _build(ingest: Ingest, alignment: Alignment | None, early: Begun | None, pro
         with closing(file):
             _write(file, replace(Correction.of(capture, full_scale=True), note=peaks.note), frames, alignment, there, progress)
     motion = None if alignment is None else alignment.statistics()
-    return _complete(capture, frames, folder, key, file, motion, peaks.kept())
+    return _complete(ingest, file, motion, peaks.kept())
 
 
 def _write(file: StackFile, correction: Correction, frames: list[Frame], alignment: Alignment | None, there: Collection[int],
@@ -293,12 +293,11 @@ def _write(file: StackFile, correction: Correction, frames: list[Frame], alignme
             raise
 
 
-def _complete(capture: Capture, frames: list[Frame], folder: Path, key: str, file: StackFile, motion: dict[str, Any] | None,
-              peaks: dict[str, Any]) -> Stack:
+def _complete(ingest: Ingest, file: StackFile, motion: dict[str, Any] | None, peaks: dict[str, Any]) -> Stack:
     """Write the saturation bits and the index of a stack whose values are in place."""
-    pixel_count = capture.camera.width * capture.camera.height
-    built = Stack(folder, key, tuple(frame.image for frame in frames), file.scale, pixel_count, motion, clipped=dict(capture.clipped),
-                  peaks=peaks)
+    folder, key, camera = ingest.folder, ingest.key, ingest.capture.camera
+    built = Stack(folder, key, tuple(frame.image for frame in ingest.frames), file.scale, camera.width * camera.height, motion,
+                  clipped=dict(ingest.capture.clipped), peaks=peaks)
     marked = bool(file.saturated.any())
     try:
         if marked:
