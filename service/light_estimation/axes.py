@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.model.samples import evenly
+
 SITES = 2000
 """Most places, spread over the object, at which the slopes are differentiated."""
 LEAST_SITES = 200
@@ -62,9 +64,8 @@ def sites(mask: np.ndarray) -> np.ndarray:  # -> [4, sites] int64
     whole = mask[middle, 2 * step :] & mask[middle, : -2 * step] & mask[2 * step :, middle] & mask[: -2 * step, middle]
     skip = max(1, min(whole.shape) // LINES)
     row, col = skip * np.array(np.nonzero(whole[::skip, ::skip]))
-    if len(row):
-        chosen = np.unique(np.linspace(0, len(row) - 1, min(SITES, len(row))).astype(int))
-        row, col = row[chosen], col[chosen]
+    chosen = evenly(len(row), SITES)
+    row, col = row[chosen], col[chosen]
     centre = (row + step) * cols + col + step
     return np.stack([centre + step, centre - step, centre - step * cols, centre + step * cols])
 

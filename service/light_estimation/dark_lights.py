@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from service.light_estimation.explanations import grey_readings
 from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.stack.stack import Stack
@@ -26,8 +26,7 @@ MOST_DARK, LEAST_LEFT = 0.25, 3
 
 def dark_frames(stack: Stack, lights: DistantLights | PlacedLights, mask: np.ndarray) -> np.ndarray:
     """Return which lights of a stack did not burn, [lights] bool. `mask`: [rows, cols] bool, the object."""
-    inside = np.flatnonzero(mask)
-    readings = grey_readings(stack.pick_radiance(inside[evenly(len(inside), PIXELS)])[0], lights.irradiance)
+    readings = grey_readings(stack.pick_radiance(some_of(mask, PIXELS))[0], lights.irradiance)
     dark = dark_lights(readings, lights.direction)
     if dark.any():  # small highlights of bare metal may lie between the pixels
         readings[dark] = _means(stack, lights.irradiance, mask.reshape(-1), dark)[:, None]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from service.light_estimation.dark_lights import dark_frames, dark_sentence
 from service.light_estimation.explanations import (
     MIN_LIGHTS,
@@ -29,8 +29,7 @@ LEFT_IN = "light from there is missing; take them again, or out of the frames"
 
 def sampled(mask: np.ndarray) -> np.ndarray:
     """Return the positions of the pixels of a sample."""
-    inside = np.flatnonzero(mask)
-    return np.asarray(inside[evenly(len(inside), PIXELS)])
+    return some_of(mask, PIXELS)
 
 
 def sample_of(stack: Stack, capture: Capture, lights: DistantLights, mask: np.ndarray) -> Sample:

@@ -7,7 +7,7 @@ is decided (service.solve.methods.shadow_light); else its bright pixels have the
 
 import numpy as np
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from kernels.status import ESTIMATED
 from service.errors import RequestError
 from service.light_estimation.explanations import grey_readings
@@ -37,8 +37,7 @@ def check_request(request: SolveRequest, capture: Capture, *, relative: bool) ->
 def moderate(given: SolveInput, lights: DistantLights | PlacedLights, capture: Capture) -> tuple[DistantLights | PlacedLights, float]:
     """Return lights under which half floats hold the albedo, and the factor by which these are brighter than those of the manifest.
     Raises ManifestError: the lights are absolute, and half floats do not hold the albedo."""
-    inside = np.flatnonzero(given.mask)
-    radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
+    radiance, usable = given.stack.pick_radiance(some_of(given.mask, PIXELS))
     readings = np.where(usable, grey_readings(radiance, lights.irradiance), 0).max(axis=0)
     magnitude = np.pi * float(np.median(readings[readings > 0])) if (readings > 0).any() else 1.0
     if MAGNITUDES[0] <= magnitude <= MAGNITUDES[1]:

@@ -37,7 +37,7 @@ def squares(given: SolveInput, lights: DistantLights, normal: np.ndarray, estima
     corners = [(SIDE * row, SIDE * col) for row in range(rows) for col in range(cols)]
     inside = [corner for corner in corners if 2 * estimated[corner[0] :, corner[1] :][:SIDE, :SIDE].sum() > SIDE * SIDE]
     chosen, (height, width) = evenly(len(lights.direction), most_lights), estimated.shape
-    for row, col in (inside[number] for number in (evenly(len(inside), MOST_SQUARES) if inside else ())):
+    for row, col in (inside[number] for number in evenly(len(inside), MOST_SQUARES)):
         place = np.arange(row, min(row + SIDE, height))[:, None] * width + np.arange(col, min(col + SIDE, width))
         pixels = place.reshape(-1)
         radiance, usable = given.stack.pick_radiance(pixels)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import ndimage
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import evenly, some_of
 from service.reporting.progress import Timings
 from stage.stack.stack import Stack
 
@@ -52,9 +52,8 @@ class _Range:
 def unlit(stack: Stack, mask: np.ndarray, timings: Timings) -> np.ndarray:
     """Return the pixels of a mask that no lamp lights, [rows, cols] bool; none where no black background in the image shows its noise."""
     found = np.zeros(mask.size, bool)
-    inside = np.flatnonzero(mask)
     dark = _range(stack, mask.shape)
-    if dark is None or dark.holds(_grey(stack, stack.pick(inside[evenly(len(inside), TRIED)])[0])).sum() < LEAST_FOUND:
+    if dark is None or dark.holds(_grey(stack, stack.pick(some_of(mask, TRIED))[0])).sum() < LEAST_FOUND:
         return found.reshape(mask.shape)
     timings.stage("background", mask.size)
     for start, stop in _bands(stack, mask):

@@ -79,13 +79,14 @@ def scratch_type(lanes: int) -> Any:
 
 
 def evenly(count: int, most: int) -> np.ndarray:
-    """Return indices at even steps from 0 to count - 1: all of them, or `most` where there are more.
-
-    Args:
-        count: one or more.
-        most: one or more.
-    """
+    """Return indices at even steps from 0 to count - 1: all of them, or `most`, one or more, where there are more."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
+def some_of(mask: np.ndarray, most: int) -> np.ndarray:
+    """Return the row-major positions of the pixels of a mask: of all of them, or of `most` at even steps where there are more."""
+    inside = np.flatnonzero(mask)
+    return np.asarray(inside[evenly(len(inside), most)])
 
 
 def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int,

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.batches import view_directions
 from service.solve.base.solution import SolveInput
@@ -137,8 +137,7 @@ def turn_by_highlights(given: SolveInput, lights: DistantLights | PlacedLights, 
     """Return what highlights show; None where there are none.
     `normal`: [3, pixels of the image] unit, as solved with these lights. `solved`: [pixels of the image] bool, where there is one.
     `height`: [rows, cols] camera-frame z in metres, where lights are near."""
-    pixels = np.flatnonzero(solved)
-    pixels = pixels[evenly(len(pixels), PIXELS)]
+    pixels = some_of(solved, PIXELS)
     radiance, usable = given.stack.pick_radiance(pixels)
     usable &= (usable.sum(axis=0) >= LEAST_LIGHTS)[None]
     lamps, strength = _lamps(lights, given.camera, height, pixels)

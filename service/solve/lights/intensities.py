@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from kernels.photometric.search.light_factors import untold
 from service.light_estimation.brightness_step import find_step
 from service.light_estimation.explanations import grey_readings
@@ -75,8 +75,7 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     or darker, they ask for that first: two numbers, of which surfaces that are not Lambertian spoil little."""
     if len(lights.direction) < LEAST_LIGHTS:
         return _declared(lights, f"fewer than {LEAST_LIGHTS} lights")
-    inside = np.flatnonzero(given.mask)
-    pixels = inside[evenly(len(inside), PIXELS)]
+    pixels = some_of(given.mask, PIXELS)
     radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance, lights.irradiance)
     declared = fit_lambertian(readings, usable, lights.direction)
@@ -139,8 +138,7 @@ def _chosen(given: SolveInput, lights: DistantLights, pixels: np.ndarray, readin
 
 def lambertian_misfit(given: SolveInput, lights: DistantLights) -> float:
     """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object."""
-    inside = np.flatnonzero(given.mask)
-    radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
+    radiance, usable = given.stack.pick_radiance(some_of(given.mask, PIXELS))
     return fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction).misfit()
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kernels.device import to_numpy
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import evenly, some_of
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from service.light_estimation.axes import Axes, sites, wrong_axes
@@ -168,8 +168,7 @@ class _Shadows:
         self._height = to_numpy(integrate_normals(
             small.normal, mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
             options=IntegrationOptions(discontinuities=True), device=given.device).height)
-        surface = np.flatnonzero(mask)
-        self._mask, self._chosen = mask, surface[evenly(len(surface), SHADOW_PIXELS)]
+        self._mask, self._chosen = mask, some_of(mask, SHADOW_PIXELS)
         some = evenly(len(lights.direction), SHADOW_LIGHTS)
         pixels = small.grid.pixels.reshape(-1)[self._chosen]
         radiance, usable = given.stack.pick_radiance(pixels)

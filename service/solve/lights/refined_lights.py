@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from service.light_estimation.explanations import grey_readings
 from service.solve.base.solution import SolveInput
 from service.solve.lights.factorisation import factorise
@@ -88,8 +88,7 @@ def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
 
 def _one_by_one(given: SolveInput, lights: DistantLights) -> RefinedLights:
     """Refine what each light has wrong of its own."""
-    inside = np.flatnonzero(given.mask)
-    radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
+    radiance, usable = given.stack.pick_radiance(some_of(given.mask, PIXELS))
     try:
         found = refine_directions(grey_readings(radiance, lights.irradiance), usable, lights.direction)
     except CalibrationError as error:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from kernels.status import ESTIMATED
 from service.light_estimation.explanations import MIN_PART, PIXELS, grey_readings
 from service.light_estimation.lambertian import fit_lambertian
@@ -113,8 +113,7 @@ def _is_matt(given: SolveInput, lights: DistantLights | PlacedLights, solved: np
         sample = near_sample(given.camera, given.mask, given.stack, lights)
         near = surface_at(sample, sample.top - mean_height(given.camera), "cpu")
         return bool(near.lit.any() and MAD_TO_SIGMA * np.median(np.abs(near.residual[near.lit])) <= LARGEST_MISFIT)
-    pixels = np.flatnonzero(solved)
-    radiance, usable = given.stack.pick_radiance(pixels[evenly(len(pixels), PIXELS)])
+    radiance, usable = given.stack.pick_radiance(some_of(solved, PIXELS))
     fit = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
     return bool(fit.spare.mean() >= MIN_PART and fit.misfit() <= LARGEST_MISFIT)
 

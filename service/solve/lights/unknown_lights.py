@@ -61,8 +61,7 @@ class _Pixels(NamedTuple):
     b: np.ndarray  # [3, pixels]
 
     def thinned(self, most: int) -> "_Pixels":
-        count = self.b.shape[1]
-        which = np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+        which = evenly(self.b.shape[1], most)
         return self._replace(residual=self.residual[:, which], compared=self.compared[:, which], b=self.b[:, which])
 
 
@@ -300,8 +299,7 @@ def _untold_by_highlights(pixels: _Pixels, point: np.ndarray) -> float:
     matrix = _matrix(np.clip(point, -5, 5))
     lights = pixels.lights @ np.linalg.inv(matrix)
     strength = np.linalg.norm(lights, axis=1, keepdims=True)
-    normal = matrix @ pixels.b
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-300)
+    normal = _unit(matrix @ pixels.b)
     half = lights / strength + np.array([0.0, 0.0, 1.0])
     half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
     angle = np.degrees(np.arccos(np.clip(half @ normal, -1, 1)))[pixels.compared]

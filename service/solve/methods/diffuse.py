@@ -10,7 +10,7 @@ from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearField, see_near
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.model.misfit import Misfit, PairFits, albedo_error, measure_misfit, standard_error, with_bounced
-from kernels.photometric.model.samples import evenly
+from kernels.photometric.model.samples import some_of
 from kernels.status import Status
 from service.sharing.sharing import Results
 from service.solve.base.batches import ReadBand, each_band
@@ -89,5 +89,4 @@ def pair_starts(mask: np.ndarray, most: int) -> np.ndarray:
     """Return the positions of the first pixels of up to `most` pairs, spread over a mask, [rows, cols] bool; the second lies APART on."""
     first = np.zeros(mask.shape, dtype=bool)
     first[:, :-APART] = mask[:, :-APART] & mask[:, APART:]
-    start = np.flatnonzero(first)
-    return start[evenly(len(start), most)] if len(start) else start
+    return some_of(first, most)

@@ -124,7 +124,7 @@ class _Walk:
         if self._few:
             self._robust = self.result.normal.copy()
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
-        self._spread = self._solvable[evenly(len(self._solvable), LOBE_PIXELS)] if len(self._solvable) else self._solvable
+        self._spread = self._solvable[evenly(len(self._solvable), LOBE_PIXELS)]
 
     def resume(self, before: Solution) -> None:
         """Take normals, albedo and roughness of the pixels that are solved from an earlier solution."""

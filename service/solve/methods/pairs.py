@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.model.samples import some_of
 from stage.spread import MAD_TO_SIGMA
 from stage.stack.stack import Stack
 
@@ -52,8 +53,7 @@ class PairFindings(NamedTuple):
 def examine_pairs(cross: Stack, parallel: Stack, partners: list[tuple[str, str]], mask: np.ndarray) -> PairFindings:
     """Compare the cross-polarised and the parallel-polarised image of every light, whose names are `partners`, over the mask."""
     block = _block(mask)
-    inside = np.flatnonzero(mask)
-    spread = inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]
+    spread = some_of(mask, PIXELS)
     crossed, along, usable = _grey(cross, parallel, spread)
     near_crossed, near_along, near_usable = _grey(cross, parallel, block.reshape(-1))
     noises, fault = [], None
