@@ -66,18 +66,6 @@ class BallView(NamedTuple):
     point: np.ndarray  # [h, w, 3] float64, on the ball, in the unit of the ball; 0 outside
 
 
-def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the origin and the direction of the line of sight of each image point.
-    Returns origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
-    perspective camera, and lies on z = 0 for an orthographic camera."""
-    x, y = camera.plane_at(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
-    zero = np.zeros_like(x)
-    if camera.projection == "orthographic":
-        return np.stack([x, y, zero], axis=-1), np.stack([zero, zero, zero - 1], axis=-1)
-    toward = np.stack([x, y, zero - 1], axis=-1)
-    return np.zeros_like(toward), toward / np.linalg.norm(toward, axis=-1, keepdims=True)
-
-
 def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, radius_m: float | None = None,
                      z_m: float | None = None) -> Ball:
     """Return the ball whose outline is a given circle, which lies wholly inside the image.
@@ -104,7 +92,7 @@ def ball_from_outline(
     For an orthographic camera the outline is a circle in the image plane. For a perspective camera the unit rays r through the
     outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
     Raises CalibrationError if the points lie on no circle."""
-    origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
+    origin, direction = camera.lines_of_sight(outline[:, 0], outline[:, 1])
     try:
         if camera.projection == "orthographic":
             centre, radius = fit_circle(origin[:, :2])
@@ -161,7 +149,7 @@ def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple
     """Intersect the lines of sight of image points with a ball.
     Returns inside [...] bool, True where the line meets the ball; point [..., 3], the intersection nearer to the camera, 0 where there is
     none; direction [..., 3], the unit direction of the line."""
-    origin, direction = lines_of_sight(camera, u, v)
+    origin, direction = camera.lines_of_sight(u, v)
     to_centre = ball.centre - origin
     along = (to_centre * direction).sum(axis=-1)
     across = np.linalg.norm(to_centre - along[..., None] * direction, axis=-1)
@@ -172,15 +160,8 @@ def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple
 
 def project(camera: Camera, point: np.ndarray) -> tuple[float, float]:
     """Return the image coordinates u and v of a camera-frame point, which is in the unit of the camera."""
-    cu, cv = camera.principal_point
-    if camera.projection == "orthographic":
-        pixel = camera.pixel_size_m or 1.0
-        return float(cu + point[0] / pixel), float(cv - point[1] / pixel)
-    assert camera.focal_px is not None  # the camera's validator saw to it
-    x, down = point[0] / -point[2], point[1] / point[2]
-    if camera.distortion is not None:
-        x, down = camera.distortion.apply(x, down)
-    return float(cu + camera.focal_px[0] * x), float(cv + camera.focal_px[1] * down)
+    u, v = camera.image_coordinates(point)
+    return float(u), float(v)
 
 
 def _box(ball: Ball, camera: Camera) -> tuple[slice, slice]:
@@ -258,7 +239,7 @@ def outline_points(coverage: np.ndarray) -> np.ndarray:
 
 def distance_px(ball: Ball, camera: Camera, outline: np.ndarray) -> np.ndarray:
     """Return the distance of image points from the outline of a ball in pixels, positive outside."""
-    origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
+    origin, direction = camera.lines_of_sight(outline[:, 0], outline[:, 1])
     if camera.projection == "orthographic":
         distance = np.linalg.norm(origin[:, :2] - ball.centre[:2], axis=1) - ball.radius
         return distance / (camera.pixel_size_m or 1.0)

@@ -140,6 +140,17 @@ class Camera(Strict):
             x, down = self.distortion.undo(x, down)
         return x, -down
 
+    def lines_of_sight(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the origin and the direction of the line of sight of each image point, of coordinates as of `plane_at`.
+        Returns origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
+        perspective camera, and lies on z = 0 for an orthographic camera."""
+        x, y = self.plane_at(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        zero = np.zeros_like(x)
+        if self.projection == "orthographic":
+            return np.stack([x, y, zero], axis=-1), np.stack([zero, zero, zero - 1], axis=-1)
+        toward = np.stack([x, y, zero - 1], axis=-1)
+        return np.zeros_like(toward), toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+
     def image_coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the image coordinates at which the camera sees points: the inverse of `plane_at`.
         `points`: [..., 3] camera frame, in front of a perspective camera; metres, or pixels when the capture has no scale. Returns u and v,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stage.capture.camera import Camera
+from stage.transforms import pixel_centres
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,11 @@ class SourcePath:
         the camera frame, metres."""
         if source_m is None or not any(source_m):
             return None
-        x, y = camera.plane_coordinates()
+        origins, rays = camera.lines_of_sight(*pixel_centres(camera.width, camera.height))
         if camera.projection == "orthographic":
-            seen = np.stack([source_m[0] - x, source_m[1] - y, np.full_like(x, source_m[2])], axis=-1)
+            seen = np.array(source_m) - origins
             return cls(-seen[..., 2], np.linalg.norm(seen, axis=-1))
-        rays = np.stack([x, y, -np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
-        return cls(rays @ np.array(source_m), np.full(x.shape, float(np.linalg.norm(source_m))))
+        return cls(rays @ np.array(source_m), np.full(rays.shape[:2], float(np.linalg.norm(source_m))))
 
     def source_range_m(self, range_m: np.ndarray | float) -> np.ndarray:
         """Return the distance from the source to the points at these ranges, [rows, cols] metres."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from service.depth.tof.tof import z_per_range
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest, SimulateRequest
-from stage.capture.camera import Camera
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.depth_normals import depth_normals
 from stage.tof.simulate import (
@@ -19,6 +18,7 @@ from stage.tof.simulate import (
     write_histograms,
 )
 from stage.tof.source import SourcePath
+from stage.transforms import pixel_centres
 
 
 def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
@@ -40,7 +40,7 @@ def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
 def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
     """Return ranges, and cosines from the normals of the depth; pixels without a depth are black, unknown normals face the camera."""
     range_m = np.where(maps.mask, maps.depth / z_per_range(maps.camera), 1.0)
-    origins, rays = _lines_of_sight(maps.camera)
+    origins, rays = maps.camera.lines_of_sight(*pixel_centres(maps.camera.width, maps.camera.height))
     normal = depth_normals(maps.depth, maps.mask, maps.camera, sigma=maps.sigma).astype(np.float64)
     known = np.linalg.norm(normal, axis=-1) > 0.5
     path = SourcePath.of(maps.camera, request.source_m)
@@ -51,13 +51,3 @@ def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
         to_source = (np.array(request.source_m) - origins - rays * range_m[..., None]) / source_range[..., None]
     cosine = np.where(known, np.clip((normal * to_source).sum(axis=-1), 0, 1), 1.0)
     return TofScene(range_m=range_m, albedo=np.where(maps.mask, request.albedo, 0.0), cosine=cosine, source_range_m=source_range)
-
-
-def _lines_of_sight(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each line of sight begins, and its unit direction away from the camera, [rows, cols, 3] each."""
-    x, y = camera.plane_coordinates()
-    flat = np.zeros_like(x)
-    if camera.projection == "orthographic":
-        return np.stack([x, y, flat], axis=-1), np.stack([flat, flat, flat - 1], axis=-1)
-    rays = np.stack([x, y, flat - 1], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
-    return np.zeros_like(rays), rays
