@@ -200,21 +200,22 @@ def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
     if misfit < LEAST_ORDER:
         return None
     numbers, found = np.arange(len(sample.directions)), []
+
+    def tell(cause: Cause, read: Sample, *, least_apart: float = 0.0, late: tuple[int, int] | None = None) -> None:
+        fit = fit_manifest(read)
+        if _explains(fit.misfit(), misfit, TIMES) and fit.apart.mean() >= least_apart:
+            found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit), late=late))
+
     texts = [np.array(sorted(numbers, key=lambda number: str(number + first))) for first in (0, 1)]
     for cause, order in ((Cause.REVERSED, numbers[::-1]), (Cause.SHIFTED, np.roll(numbers, 1)), (Cause.SHIFTED, np.roll(numbers, -1)),
                          *((Cause.TEXT, order) for text in texts for order in (text, np.argsort(text)) if (text != numbers).any())):
-        fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
-        if _explains(fit.misfit(), misfit, TIMES):
-            found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
-    for cause, other in ((Cause.BALL_NORMALS, from_ball_normals), (Cause.ELEVATION, from_other_elevations)):
-        fit = fit_manifest(sample._replace(directions=other(sample.directions)))
-        if len(numbers) >= MIN_LIGHTS_FREE and fit.apart.mean() >= ROUND and _explains(fit.misfit(), misfit, TIMES):
-            found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
+        tell(cause, sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
+    if len(numbers) >= MIN_LIGHTS_FREE:
+        for cause, other in ((Cause.BALL_NORMALS, from_ball_normals), (Cause.ELEVATION, from_other_elevations)):
+            tell(cause, sample._replace(directions=other(sample.directions)), least_apart=ROUND)
     if len(numbers) >= MIN_LIGHTS_LATE:
         late = _late(sample)
-        fit = fit_manifest(_moved(sample, *late))
-        if _explains(fit.misfit(), misfit, TIMES):
-            found.append(Explanation(Cause.SHIFTED, misfit, fit.misfit(), _angle(given, fit), late=late))
+        tell(Cause.SHIFTED, _moved(sample, *late), late=late)
     return min(found, key=lambda one: one.left if one.late is None else ABOUT * one.left, default=None)
 
 

@@ -69,11 +69,11 @@ def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
 
     It is 0 in the attached shadow and outside the ball. A point light needs a view in metres.
     """
+    cosine = np.maximum(_cosine(light, view), 0)
     if isinstance(light, DistantLight):
-        return np.maximum(view.normal @ np.array(light.direction), 0)
+        return cosine
     way = np.array(light.position_m) - view.point
     distance = np.linalg.norm(way, axis=-1)
-    cosine = np.maximum((view.normal * way).sum(axis=-1) / distance, 0)
     if light.axis is not None and light.anisotropy is not None:
         lobe = np.maximum(-(way @ np.array(light.axis)) / distance, 0)
         cosine = cosine * lobe**light.anisotropy
@@ -89,8 +89,7 @@ def fit_brightness(
     """Measure the brightness of a light of known position, in each channel by re-weighted least squares of reading = scale · shading.
     Raises CalibrationError if fewer than MIN_PIXELS readings are lit and unsaturated; the message does not name the frame."""
     shading = received(light, view)
-    incidence = view.normal @ np.array(light.direction) if isinstance(light, DistantLight) else _cosine(light, view)
-    usable = _usable(saturated, view) & (incidence > MIN_COSINE)
+    usable = _usable(saturated, view) & (_cosine(light, view) > MIN_COSINE)
     _check_count(int(usable.sum()))
     model, readings = shading[usable], radiance[usable].astype(np.float64)
     scale = np.median(readings / model[:, None], axis=0)
@@ -111,8 +110,7 @@ def dark_side(radiance: np.ndarray, saturated: np.ndarray | None, light: Distant
               ) -> float | None:
     """Return the light on the dark side of the ball, as a part of that where it faces the light; None if that side is not seen.
     `radiance`, `saturated`, `light`, `view`: as of fit_brightness. `scale`: what fit_brightness found."""
-    incidence = view.normal @ np.array(light.direction) if isinstance(light, DistantLight) else _cosine(light, view)
-    dark = _usable(saturated, view) & (incidence < DARK_COSINE)
+    dark = _usable(saturated, view) & (_cosine(light, view) < DARK_COSINE)
     if dark.sum() < DARK_PIXELS:
         return None
     return float(np.median(radiance[dark].mean(axis=-1)) / (scale.mean() * received(light, view)[view.inside].max()))
@@ -174,7 +172,9 @@ def _usable(saturated: np.ndarray | None, view: BallView) -> np.ndarray:
     return usable if saturated is None else usable & ~saturated
 
 
-def _cosine(light: PointLight, view: BallView) -> np.ndarray:
+def _cosine(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
+    if isinstance(light, DistantLight):
+        return np.asarray(view.normal @ np.array(light.direction))
     way = np.array(light.position_m) - view.point
     return (view.normal * way).sum(axis=-1) / np.linalg.norm(way, axis=-1)
 
