@@ -31,8 +31,7 @@ def camera_attributes(camera: Camera) -> dict[str, Any]:
 
     Convention: the matrices apply to row vectors; lens distortion is in `relit:camera` alone.
     """
-    pose = np.eye(4) if camera.world_from_camera is None else np.array(camera.world_from_camera, dtype=np.float64)
-    camera_from_world = np.linalg.inv(pose)
+    camera_from_world = np.linalg.inv(camera.pose)
     found: dict[str, Any] = {
         CAMERA: camera.model_dump_json(),
         "worldToCamera": _rows(TO_LEFT_HANDED @ camera_from_world),

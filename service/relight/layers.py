@@ -120,12 +120,12 @@ def still_layers(layers: Collection[Layer], capture: Capture | None, maps: Surfa
 
 def _world_normal(maps: SurfaceMaps, _: str) -> np.ndarray:
     assert maps.normal is not None
-    return maps.normal @ _pose(maps)[:3, :3].T
+    return maps.normal @ maps.camera.pose[:3, :3].T
 
 
 def _position(maps: SurfaceMaps, _: str) -> np.ndarray:
     assert maps.height is not None
-    pose = _pose(maps)
+    pose = maps.camera.pose
     return maps.camera.points(maps.height) @ pose[:3, :3].T + pose[:3, 3]
 
 
@@ -137,11 +137,6 @@ def _depth(maps: SurfaceMaps, _: str) -> np.ndarray:
 def _albedo(maps: SurfaceMaps, space: str) -> np.ndarray:
     assert maps.diffuse_albedo is not None
     return maps.diffuse_albedo @ rgb_matrix(maps.color_space, space).T if space != maps.color_space else maps.diffuse_albedo
-
-
-def _pose(maps: SurfaceMaps) -> np.ndarray:
-    pose = maps.camera.world_from_camera
-    return np.eye(4) if pose is None else np.array(pose, dtype=np.float64)
 
 
 DERIVED: dict[Layer, Callable[[SurfaceMaps, str], np.ndarray]] = {

@@ -99,6 +99,11 @@ class Camera(Strict):
         """True when solved heights are in metres; otherwise they are in units of pixels."""
         return self.pixel_size_m is not None if self.projection == "orthographic" else self.surface_z_m is not None
 
+    @property
+    def pose(self) -> np.ndarray:
+        """`world_from_camera`, [4, 4] float64, or that of a camera which is the world."""
+        return np.eye(4) if self.world_from_camera is None else np.array(self.world_from_camera, dtype=np.float64)
+
     def cropped(self, crop: Crop) -> "Camera":
         """Return the camera whose image is a part of the image of this one: its principal point moves, its frame stays."""
         cu, cv = self.principal_point

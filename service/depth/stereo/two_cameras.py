@@ -112,7 +112,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         warnings.append(sentence("--beside: camera", contradicted, given, capture.camera))
         told["contradiction_px"] = float(f"{contradicted.size_px:.3g}")
         if view is not given:
-            pose = _world(capture) @ np.array(view.camera_from_projector)
+            pose = capture.camera.pose @ np.array(view.camera_from_projector)
             told["refined"] = view_facts(view, "world_from_camera", pose.tolist())
         if not (contradicted.plausible or contradicted.aside) and request.least_confidence is None:
             solution.status[solution.solved] = Status.UNSURE
@@ -152,7 +152,7 @@ def _second_camera(capture: Capture, other: Capture) -> Projector:
     if camera.world_from_camera is None:
         raise ManifestError(f"{other.folder / FILE_NAME}: camera.world_from_camera: is missing: two cameras are triangulated by their "
                             "poses in one world (that of the first camera, where its capture gives none)")
-    pose = np.linalg.inv(_world(capture)) @ np.array(camera.world_from_camera)
+    pose = np.linalg.inv(capture.camera.pose) @ np.array(camera.world_from_camera)
     seen_by = as_projector(camera, pose)
     try:
         return check_projector(replace(capture, manifest=capture.manifest.model_copy(update={"projector": seen_by})))
@@ -160,12 +160,6 @@ def _second_camera(capture: Capture, other: Capture) -> Projector:
         raise ManifestError(str(error).replace(f"{capture.folder / FILE_NAME}: projector.camera_from_projector",
                                                f"{other.folder / FILE_NAME}: camera.world_from_camera").replace(
                                                    "the projector", "the second camera")) from error
-
-
-def _world(capture: Capture) -> np.ndarray:
-    """Return the pose of a camera in the world, [4, 4] metres: that of its capture, or of the world itself."""
-    pose = capture.camera.world_from_camera
-    return np.eye(4) if pose is None else np.array(pose)
 
 
 def _uncalibrated(capture: Capture) -> Capture:
