@@ -106,13 +106,12 @@ class Guide:
 
     def _sums(self, rows: int, take: Callable[[Captured], wp.array], progress: Timings | None, before: int = 0) -> np.ndarray:
         """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch; `before`: steps of the progress until then."""
-        sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
+        sums = np.zeros((rows, len(self._model.pixels)), dtype=np.float32)
         for batch in self._model.batches():
             taken = take(self._captured(batch, self._recorded, self._visible(batch)))
-            sums[:, done : done + len(batch.pixels)] = to_numpy(taken)[:, : len(batch.pixels)]
-            done += len(batch.pixels)
+            sums[:, batch.part] = to_numpy(taken)[:, : len(batch.pixels)]
             if progress is not None:
-                progress.advance(before + done)
+                progress.advance(before + batch.part.stop)
         return sums
 
     def _captured(self, batch: ModelBatch, images: ImagesOnDevice[Stack], visible: wp.array, band: Band | None = None) -> Captured:
@@ -124,10 +123,7 @@ class Guide:
         """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
         lights, stack, count = self._lights, self._recorded.stack, len(self._lights.direction)
         found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        done = 0
         for batch in self._model.batches():
-            part = slice(done, done + len(batch.pixels))
-            done = part.stop
             if not stack.pick_saturated(batch.pixels).any():
                 continue
             values, bits = stack.pick(batch.pixels)
@@ -139,7 +135,7 @@ class Guide:
                 read = values[:, light].astype(np.float32) * stack.scale[light]
                 short = np.where(channels[:, light], np.maximum(told - read, 0), 0)
                 at = np.flatnonzero(short.any(axis=0))
-                found.append((batch.pixels[at], np.full(len(at), light), (read + self.trust[part] * short)[:, at]))
+                found.append((batch.pixels[at], np.full(len(at), light), (read + self.trust[batch.part] * short)[:, at]))
         if not found:
             return self._recorded
         pixel, light, radiance = zip(*found, strict=True)
@@ -155,14 +151,11 @@ class Guide:
             specular: whether [frames, 3, pixels] float32 of that part, between 0 and the frame, is returned.
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
-        done = 0
         for batch in self._model.batches():
-            part = slice(done, done + len(batch.pixels))
-            done = part.stop
             band = self.images.pick(batch.pixels)
             for index, light in enumerate(lights):
                 frame, mirror = frames[index : index + 1], None if mirrored is None else mirrored[index : index + 1]
-                self._add(frame, mirror, batch.pixels, part, self._lit(batch, band, light))
+                self._add(frame, mirror, batch.pixels, batch.part, self._lit(batch, band, light))
         return mirrored
 
     def correct_range(self, frames: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
@@ -177,15 +170,14 @@ class Guide:
         chunk = self._range.chunk(lights, places)
         if chunk.beyond is not None:
             _ = self.least_beyond  # before several threads ask for it
-        done = 0
         for batch in self._model.batches():
             band = self.images.pick(batch.pixels)
 
-            def use(at: slice, lit: LitModel, batch: ModelBatch = batch, done: int = done) -> None:
-                self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
+            def use(at: slice, lit: LitModel, batch: ModelBatch = batch) -> None:
+                first = batch.part.start
+                self._add(frames, mirrored, batch.pixels[at], slice(first + at.start, first + at.stop), lit)
 
             self._range.light(batch, band, self.images.stack.scale, self._visible(batch), chunk, use)
-            done += len(batch.pixels)
         return mirrored
 
     def frames_on_device(self, weights: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
@@ -203,17 +195,16 @@ class Guide:
         light = LightOnDevice(self._range.chunk(lights, places), FramesOnDevice(radiance, mirrored), places)
         trust = self._trust_on_device
         beyond = wp.empty(0, dtype=wp.float32, device=device) if light.chunk.beyond is None else self._trust_beyond_on_device
-        done = 0
         for batch in self._model.batches():
-            def use(portion: Portion, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array, done: int = done) -> None:
-                part = slice(done + portion.pixels.start, done + portion.pixels.stop)
+            def use(portion: Portion, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array,
+                    first: int = batch.part.start) -> None:
+                part = slice(first + portion.pixels.start, first + portion.pixels.stop)
                 pixels = Pixels(portion.surface.values, self._model.positions[part], trust[part],
                                 *((beyond[part], self.least_beyond) if len(beyond) else (beyond, 0.0)))
                 light.correct(portion, pixels, facing, grid, captured, shown)
 
             self._range.light_on_device(batch, self.images.pick(batch.pixels), self.images.stack.scale, self._visible(batch), light.chunk,
                                         use)
-            done += len(batch.pixels)
         if halves:
             return np.stack([to_numpy(to_halves(radiance[place])) for place in places])[..., :count], None
         frames, mirror = (to_numpy(each)[list(places) if len(each) else [], :, :count] for each in (radiance, mirrored))
@@ -273,22 +264,19 @@ class Guide:
         if not near.fine.count:
             return
         fine, coarse = self._beyond(near.fine), self._beyond(near.coarse)
-        done = 0
         for batch in self._model.batches():
-            part = slice(done, done + len(batch.pixels))
             visible = self._visible(batch, near.marched)
             wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(1 - fine), near.coarse.scaled(1 - coarse))
-            added = pictures + self.trust[part] * followed(wanted.sum(axis=0) - told, np.minimum(pictures, told), told)
+            added = pictures + self.trust[batch.part] * followed(wanted.sum(axis=0) - told, np.minimum(pictures, told), told)
             mirror = wanted[1]
             if fine.any() or coarse.any():
                 wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(fine), near.coarse.scaled(coarse))
-                added = added + pictures + trusted(followed(wanted.sum(axis=0) - told, pictures, told), self.trust_beyond[part],
+                added = added + pictures + trusted(followed(wanted.sum(axis=0) - told, pictures, told), self.trust_beyond[batch.part],
                                                      self.least_beyond)
                 mirror = mirror + wanted[1]
             added = np.maximum(added, 0)
             frame[:, batch.pixels] += added
             specular[:, batch.pixels] += np.clip(mirror, 0, added)
-            done = part.stop
 
     def _beyond(self, sources: Sources) -> np.ndarray:
         """Return how far near samples lie beyond the captured lights, as the middle of the surface sees them."""

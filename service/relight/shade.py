@@ -133,12 +133,10 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
     rows, light = np.concatenate([*places, close.marched]), join([wanted, close.fine])
     frame, specular = (np.zeros((3, maps.mask.size), dtype=np.float32) for _ in range(2))
     timings.stage("shade", len(model.pixels))
-    done = 0
     for batch in model.batches():
         lit = model.lit(batch, light, model.see(rows, batch))
         frame[:, batch.pixels], specular[:, batch.pixels] = lit[:3] + lit[3:], lit[3:]
-        done += len(batch.pixels)
-        timings.advance(done)
+        timings.advance(batch.part.stop)
     assert maps.diffuse_albedo is not None
     usual = float(np.median(maps.diffuse_albedo.reshape(-1, 3)[model.pixels].max(axis=1)))
     bright = () if usual <= 1 else (

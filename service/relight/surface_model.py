@@ -42,6 +42,8 @@ NORMAL_CELLS = 32
 class ModelBatch(NamedTuple):
     """Some pixels of the surface on the device."""
 
+    part: slice
+    """Where its pixels are among those of the model."""
     pixels: np.ndarray  # [n] row-major positions in the image
     surface: Surface
     profile: np.ndarray | None  # [n, 3] of the specular part; None: that of the BRDF
@@ -134,9 +136,9 @@ class SurfaceModel:
 
     def _made(self) -> Iterator[ModelBatch]:
         for start in range(0, len(self.pixels), self._batch_pixels):
-            pixels = self.pixels[start : start + self._batch_pixels]
-            profile = None if self.profile is None else self.profile[start : start + len(pixels)]
-            yield ModelBatch(pixels, self._surface(pixels, self.normals(pixels), self.places(pixels), profile), profile)
+            part = slice(start, min(start + self._batch_pixels, len(self.pixels)))
+            pixels, profile = self.pixels[part], None if self.profile is None else self.profile[part]
+            yield ModelBatch(part, pixels, self._surface(pixels, self.normals(pixels), self.places(pixels), profile), profile)
 
     def _surface(self, pixels: np.ndarray, normal: np.ndarray, places: np.ndarray, profile: np.ndarray | None) -> Surface:
         """Put pixels on the device, with these normals and places."""

@@ -122,15 +122,13 @@ def _write_model(model: SurfaceModel, lights: DistantLights | PlacedLights, grid
     sources = light_sources(lights)
     width = model.maps.mask.shape[1]
     timings.stage("model", len(model.pixels))
-    done = 0
     for batch in model.batches():
         values, hidden = _lit(model, batch, sources, scale)
         places = grid.places(batch.pixels, width)
         flags[places] |= hidden
         for run in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1):
             file.write_at(offset + int(places[run[0]]) * sources.count * MODEL_BYTES, values[run])
-        done += len(batch.pixels)
-        timings.advance(done)
+        timings.advance(batch.part.stop)
 
 
 def _lit(model: SurfaceModel, batch: ModelBatch, sources: Sources, scale: float) -> tuple[np.ndarray, np.ndarray]:
