@@ -161,7 +161,7 @@ class FrameWriter:
             with self._lock:
                 self._tell(begun + len(files) * first // height)
             part = form.rows(first, last)
-            self._pending = [self._pool.submit(self._append, to, file, frame, {name: layer[index] for name, layer in colours.items()}, part)
+            self._pending = [self._pool.submit(self._write, file, frame, {name: layer[index] for name, layer in colours.items()}, part, to)
                              for index, ((_, to), file, frame) in enumerate(zip(opened, files, frames, strict=True))]
 
         try:
@@ -186,20 +186,17 @@ class FrameWriter:
         for job in pending:
             job.result()
 
-    def _write(self, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> None:
+    def _write(self, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat,
+               rows: exr_rows.RowFile | None = None) -> None:
+        """Write a frame as a file of its own, or some of its rows to one that grows."""
         began = time.perf_counter()
         parts, clipped, peak = _parts(file, frame, colours, form)
         halved = time.perf_counter()
-        exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata}, checksum=True)
-        self._count(1, clipped, peak, began, halved)
-
-    def _append(self, to: exr_rows.RowFile, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray],
-                form: FrameFormat) -> None:
-        began = time.perf_counter()
-        parts, clipped, peak = _parts(file, frame, colours, form)
-        halved = time.perf_counter()
-        to.append(parts)
-        self._count(0, clipped, peak, began, halved)
+        if rows is None:
+            exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata}, checksum=True)
+        else:
+            rows.append(parts)
+        self._count(1 if rows is None else 0, clipped, peak, began, halved)
 
     def _end(self, growing: AbstractContextManager[exr_rows.RowFile]) -> None:
         began = time.perf_counter()
