@@ -82,12 +82,12 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
                  rate: float) -> list[str]:
     """Return a hash for each frame of everything that its pixels and its camera and time attributes depend on; the request has the weights
     that are used."""
-    mask = opened.capture.manifest.mask
+    mask = opened.capture.manifest.mask if request.matte is not FrameMatte.NONE or Layer.MASK in request.aov else None
     scene = _hash(
         stack=opened.ingest.key, direction=_digits(opened.lights.direction), irradiance=_digits(opened.lights.irradiance),
         layers=sorted(request.aov), camera=opened.capture.camera.model_dump_json(), rate=rate,
         maps=None if opened.maps is None else fingerprint.digest(opened.maps),
-        mask=fingerprint.digest(opened.capture.file(mask)) if mask is not None and _has_mask(request) else None,
+        mask=fingerprint.digest(opened.capture.file(mask)) if mask is not None else None,
         **({"ocio": current().label} if location() != BUILT_IN else {}),
         **{name: value for name, value in choices(request).items() if name not in RESOLVED})
     return [_hash(
@@ -96,11 +96,6 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
         [environments.content(frame.environment.path), frame.environment.exposure_stops, _digits(frame.environment.rotation)],
         discs=[[_digits(disc.direction), _digits(disc.irradiance), disc.angle_degrees, disc.color_space] for disc in frame.discs],
     ) for frame in frames]
-
-
-def _has_mask(request: RelightRequest) -> bool:
-    """Return whether the frames depend on the mask of the capture."""
-    return request.matte is not FrameMatte.NONE or Layer.MASK in request.aov
 
 
 def is_complete(path: Path, request_hash: str) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from stage.model import Vector
 from stage.transforms import rotation_about, rotation_about_y
 
 UPRIGHT = (0.0, 1.0, 0.0)
+AnyKey = TypeVar("AnyKey", bound=Key)
 
 
 class TurnedEnvironment(NamedTuple):
@@ -86,58 +87,47 @@ def schedule(request: RelightRequest | DriveRequest, numbers: Sequence[int], key
             result.append(ScheduledFrame(number, environment, (), {}, exposure))
             continue
         if keys.exposure:
-            at = key_interval(keys.exposure, number)
-            exposure += float(lerp((keys.exposure[at.first].stops,), (keys.exposure[at.second].stops,), at.fraction)[0])
+            one, other, part = keys_around(keys.exposure, number)
+            exposure += float(lerp(one.stops, other.stops, part))
         discs = tuple(_disc(track, number) for track in keys.lights)
         result.append(ScheduledFrame(number, environment, discs, _captured(keys.captured, number), exposure))
     return result
 
 
 def _keyed_environment(path: Path, keys: Sequence[EnvironmentKey], number: int) -> TurnedEnvironment:
-    at = key_interval(keys, number)
-    one, other = keys[at.first], keys[at.second]
-    turn, exposure = lerp((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), at.fraction)
-    x, y, z = slerp(one.axis, other.axis, at.fraction)
+    one, other, part = keys_around(keys, number)
+    turn, exposure = lerp((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), part)
+    x, y, z = slerp(one.axis, other.axis, part)
     axis = float(x), float(y), float(z)
     return TurnedEnvironment(path, float(turn), axis, rotation_about(axis, float(turn)), float(exposure))
 
 
 def _disc(track: LightTrack, number: int) -> Disc:
-    at = key_interval(track.keys, number)
-    one, other = track.keys[at.first], track.keys[at.second]
-    return Disc(slerp(one.direction, other.direction, at.fraction), lerp(one.irradiance, other.irradiance, at.fraction),
-                float(lerp((one.angle_degrees,), (other.angle_degrees,), at.fraction)[0]), track.color_space)
+    one, other, part = keys_around(track.keys, number)
+    return Disc(slerp(one.direction, other.direction, part), lerp(one.irradiance, other.irradiance, part),
+                float(lerp(one.angle_degrees, other.angle_degrees, part)), track.color_space)
 
 
 def _captured(tracks: Sequence[CapturedTrack], number: int) -> dict[str, float]:
     weights: dict[str, float] = {}
     for track in tracks:
-        at = key_interval(track.keys, number)
-        weight = float(lerp((track.keys[at.first].weight,), (track.keys[at.second].weight,), at.fraction)[0])
-        weights[track.image] = weights.get(track.image, 0.0) + weight
+        one, other, part = keys_around(track.keys, number)
+        weights[track.image] = weights.get(track.image, 0.0) + float(lerp(one.weight, other.weight, part))
     return weights
 
 
-class KeyInterval(NamedTuple):
-    """The place of a frame between two neighbouring keys."""
-
-    first: int
-    second: int
-    fraction: float
-    """0 at the first, 1 at the second."""
-
-
-def key_interval(keys: Sequence[Key], frame: int) -> KeyInterval:
-    """Return the keys around a frame; before the first and after the last key their values hold."""
+def keys_around(keys: Sequence[AnyKey], frame: int) -> tuple[AnyKey, AnyKey, float]:
+    """Return the keys around a frame and its fraction of the way from one to the other; before the first and after the last key their
+    values hold."""
     after = next((index for index, key in enumerate(keys) if key.frame > frame), len(keys))
     if after == 0 or after == len(keys) or keys[after - 1].interpolation == "step":
-        held = max(0, after - 1)
-        return KeyInterval(held, held, 0.0)
+        held = keys[max(0, after - 1)]
+        return held, held, 0.0
     one, other = keys[after - 1], keys[after]
-    return KeyInterval(after - 1, after, (frame - one.frame) / (other.frame - one.frame))
+    return one, other, (frame - one.frame) / (other.frame - one.frame)
 
 
-def lerp(first: Sequence[float], second: Sequence[float], fraction: float) -> np.ndarray:
+def lerp(first: float | Sequence[float], second: float | Sequence[float], fraction: float) -> np.ndarray:
     """Return the linear interpolation of two values, float64."""
     return (1 - fraction) * np.asarray(first, dtype=np.float64) + fraction * np.asarray(second, dtype=np.float64)
 
