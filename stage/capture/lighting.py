@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.capture.capture import SOURCES, Capture
-from stage.capture.light import PLACEHOLDER, DistantLight, ExtendedLight, GradientLight, PointLight
+from stage.capture.light import PLACEHOLDER, DistantLight, ExtendedLight, PointLight
 from stage.capture.manifest import FILE_NAME
-from stage.capture.point_lights import DistantLights, PlacedLights, place_lights
+from stage.capture.point_lights import DistantLights, PlacedLights, lights_of, place_lights
 from stage.capture.polarised_pairs import check_pairs
 from stage.errors import ManifestError
 
@@ -86,14 +86,7 @@ def extended_lights(capture: Capture) -> ExtendedLights:
 def distant_lights(capture: Capture) -> DistantLights:
     """Return the lights of the stack of a capture, all of which must be distant.
     Raises ManifestError if a light is not distant, or there is none; the message names the frame."""
-    where = capture.folder / FILE_NAME
-    for index, frame in enumerate(capture.manifest.frames):
-        if isinstance(frame.light, SOURCES) and not isinstance(frame.light, DistantLight):
-            hint = " (relit solve --method gradient solves gradients)" if isinstance(frame.light, GradientLight) else ""
-            raise ManifestError(f"{where}: frames[{index}].light: is {frame.light.type}: this needs distant lights{hint}")
-    lights = [light for _, light in capture.lit_by(DistantLight)]
-    if not lights:
-        raise ManifestError(capture.none_is_lit("a distant light"))
+    lights = [light for _, light in lights_of(capture, "distant", DistantLight)]
     found = DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
     check_pairs(capture, found.direction)
     return found

@@ -1,6 +1,6 @@
 """The point lights of a capture as arrays: their positions, and their directions and irradiances at the centre of the object."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from stage.capture.manifest import FILE_NAME
 from stage.capture.polarised_pairs import check_pairs
 from stage.errors import ManifestError
 
+AtOnePlace = TypeVar("AtOnePlace", bound=DistantLight | PointLight)
 LEAST_SPAN = 0.01
 """Largest distance of near lights along an axis, over the width of the object, below which one of the two is in another unit: lights so
 close together leave normals open."""
@@ -56,19 +57,24 @@ class LightPlaces(NamedTuple):
     lobe: np.ndarray  # [lights, 4] float64
 
 
+def lights_of(capture: Capture, needed: str, *kinds: type[AtOnePlace]) -> list[tuple[int, AtOnePlace]]:
+    """Return the lights of the stack of a capture, each with the number of its frame, all of which must be of one of these kinds.
+    `needed`: the kinds in words. Raises ManifestError if a light is of another kind, or there is none; the message names the frame."""
+    frames = capture.manifest.frames
+    for index, frame in enumerate(frames):
+        if isinstance(frame.light, SOURCES) and not isinstance(frame.light, kinds):
+            hint = " (relit solve --method gradient solves gradients)" if isinstance(frame.light, GradientLight) else ""
+            raise ManifestError(f"{capture.folder / FILE_NAME}: frames[{index}].light: is {frame.light.type}: this needs {needed} "
+                                f"lights{hint}")
+    lights: list[tuple[int, AtOnePlace]] = [(index, frame.light) for index, frame in enumerate(frames) if isinstance(frame.light, kinds)]
+    if not lights:
+        raise ManifestError(capture.none_is_lit(f"a {needed} light"))
+    return lights
+
+
 def light_places(capture: Capture) -> LightPlaces:
     """Return where the lights of the stack of a capture are, all of which must be distant or point lights."""
-    where = capture.folder / FILE_NAME
-    lights = []
-    for index, frame in enumerate(capture.manifest.frames):
-        if isinstance(frame.light, DistantLight | PointLight):
-            lights.append((index, frame.light))
-        elif isinstance(frame.light, SOURCES):
-            hint = " (relit solve --method gradient solves gradients)" if isinstance(frame.light, GradientLight) else ""
-            kind = frame.light.type
-            raise ManifestError(f"{where}: frames[{index}].light: is {kind}: this needs distant or point lights{hint}")
-    if not lights:
-        raise ManifestError(capture.none_is_lit("a distant or point light"))
+    lights: list[tuple[int, DistantLight | PointLight]] = lights_of(capture, "distant or point", DistantLight, PointLight)
     place, strength, lobe = np.zeros((len(lights), 4)), np.zeros((len(lights), 3)), np.zeros((len(lights), 4))
     for row, (_, light) in enumerate(lights):
         if isinstance(light, DistantLight):
