@@ -103,73 +103,9 @@ def glossy(given: argparse.Namespace) -> list[str] | None:
     return lines
 
 
-def materials(given: argparse.Namespace) -> list[str] | None:
-    """Measure the effect of materials that pixels share."""
-    return material_table(given.glossy, given.relighting)
-
-
-def fresnel(given: argparse.Namespace) -> list[str] | None:
-    """Measure what Schlick's approximation makes of F0."""
-    return fresnel_table(given.glossy, given.relighting)
-
-
-def ablation(given: argparse.Namespace) -> list[str] | None:
-    """Measure the parts of the general solver, one at a time."""
-    return ablation_table(given.data, given.glossy, given.relighting)
-
-
-def relighting(given: argparse.Namespace) -> list[str]:
-    """Compare relit and shaded images with the path tracer."""
-    return relighting_table(given.relighting)
-
-
-def left_out(given: argparse.Namespace) -> list[str] | None:
-    """Measure how well real lights are predicted from others."""
-    return None if given.data is None else left_out_table(given.data)
-
-
-def spin(_: argparse.Namespace) -> list[str]:
-    """Measure the time of the parts of a frame range."""
-    return spin_table()
-
-
-def rig(given: argparse.Namespace) -> list[str] | None:
-    """Measure depth from projected codes and lasers."""
-    return None if given.rig is None else rig_table(given.rig)
-
-
 def speed(_: argparse.Namespace) -> list[str]:
     """Measure the table of `relit bench`, and the general solver against NumPy."""
     return [*bench(BenchRequest()), "", *search_rows()]
-
-
-def gpu(_: argparse.Namespace) -> None:
-    """Keep the section that `python -m benchmarks.gpu --write` has written on a machine with a GPU."""
-
-
-def estimate(_: argparse.Namespace) -> list[str]:
-    """Estimate the time on a GPU from what products ask of it."""
-    return estimate_rows()
-
-
-def asked(_: argparse.Namespace) -> list[str]:
-    """Say per megapixel what products ask of a device."""
-    return asked_rows()
-
-
-def registers(_: argparse.Namespace) -> list[str]:
-    """Compare registers and warps of the hottest kernels with what launch bounds would make of them."""
-    return register_rows()
-
-
-def paired(given: argparse.Namespace) -> list[str] | None:
-    """Compare the processor seconds of products with an older version's."""
-    return None if given.before is None else paired_rows(given.before)
-
-
-def tof(_: argparse.Namespace) -> list[str]:
-    """Measure the range errors of time of flight."""
-    return [*accuracy_rows(), "", *bound_rows()]
 
 
 def depth_speed(_: argparse.Namespace) -> list[str]:
@@ -202,56 +138,34 @@ def _measure(*arguments: str) -> tuple[float, float]:
     return time.perf_counter() - before, peak / 2**20
 
 
-def memory(given: argparse.Namespace) -> list[str] | None:
-    """Measure the stages and the peak memory of a large capture."""
-    return None if given.large is None else large_table(given.large, given.megapixels, given.lights, given.frames)
-
-
-def set_faults(_: argparse.Namespace) -> list[str]:
-    """Count captures whose faults are named."""
-    return fault_table()
-
-
-def set_times(_: argparse.Namespace) -> list[str]:
-    """Measure Relit's part of the time of a capture."""
-    return time_table()
-
-
-def studio(_: argparse.Namespace) -> list[str]:
-    """Measure charts and published planes."""
-    return studio_rows()
-
-
-def products(_: argparse.Namespace) -> None:
-    """Keep the section: `python -m benchmarks.gpu.products FOLDER --write` measures it, on a machine with a GPU."""
-
-
 SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
     "glossy": ("Glossy and metallic objects", glossy),
-    "materials": ("Effect of sharing materials", materials),
-    "fresnel": ("F0 of dielectrics under Schlick's approximation", fresnel),
-    "ablation": ("Effect of each part of `svbrdf`", ablation),
-    "relighting": ("Relighting", relighting),
-    "left_out": ("Real lights left out", left_out),
-    "spin": ("A spin of 240 frames", spin),
-    "rig": ("Depth from projected light", rig),
+    "materials": ("Effect of sharing materials", lambda given: material_table(given.glossy, given.relighting)),
+    "fresnel": ("F0 of dielectrics under Schlick's approximation", lambda given: fresnel_table(given.glossy, given.relighting)),
+    "ablation": ("Effect of each part of `svbrdf`", lambda given: ablation_table(given.data, given.glossy, given.relighting)),
+    "relighting": ("Relighting", lambda given: relighting_table(given.relighting)),
+    "left_out": ("Real lights left out", lambda given: None if given.data is None else left_out_table(given.data)),
+    "spin": ("A spin of 240 frames", lambda _: spin_table()),
+    "rig": ("Depth from projected light", lambda given: None if given.rig is None else rig_table(given.rig)),
     "speed": ("Speed", speed),
-    "gpu": ("On a GPU", gpu),
-    "products": ("Products on a GPU", products),
-    "estimate": ("Estimate for a GPU", estimate),
-    "asked": ("Asked of a device", asked),
-    "registers": ("Registers of kernels", registers),
-    "paired": ("Speed beside an older version", paired),
-    "tof": ("Depth from time of flight", tof),
+    "gpu": ("On a GPU", lambda _: None),  # `python -m benchmarks.gpu --write` writes it, on a machine with a GPU
+    "products": ("Products on a GPU", lambda _: None),  # `python -m benchmarks.gpu.products FOLDER --write`, on such a machine too
+    "estimate": ("Estimate for a GPU", lambda _: estimate_rows()),
+    "asked": ("Asked of a device", lambda _: asked_rows()),
+    "registers": ("Registers of kernels", lambda _: register_rows()),
+    "paired": ("Speed beside an older version", lambda given: None if given.before is None else paired_rows(given.before)),
+    "tof": ("Depth from time of flight", lambda _: [*accuracy_rows(), "", *bound_rows()]),
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
-    "memory": ("Memory", memory),
-    "set_faults": ("Faults of captures", set_faults),
-    "set_times": ("Time of captures", set_times),
-    "studio": ("Charts and publications", studio),
+    "memory": ("Memory", lambda given: None if given.large is None else large_table(given.large, given.megapixels, given.lights,
+                                                                                     given.frames)),
+    "set_faults": ("Faults of captures", lambda _: fault_table()),
+    "set_times": ("Time of captures", lambda _: time_table()),
+    "studio": ("Charts and publications", lambda _: studio_rows()),
 }
+"""Title of each section, and what measures it; None: what the page says already is kept."""
 INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\n"
                 "Written by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "
                 "measured. The times are from a machine that other work shared: ratios hold on other machines, seconds do not.\n")
