@@ -95,10 +95,8 @@ def truth_layers(truth: Truth, *, specular: bool, dtype: type = np.float16) -> d
     return layers | {"height.Z": truth.height.astype(np.float32), "mask.Y": truth.mask.astype(dtype)}
 
 
-def manifest(
-    *, name: str, truth: Truth, pixel_size_m: float, directions: np.ndarray, irradiance: np.ndarray, image_pattern: str
-) -> dict:
-    """Return the capture.json of an orthographic capture with one light a frame."""
+def manifest(*, name: str, truth: Truth, pixel_size_m: float, directions: np.ndarray, irradiance: np.ndarray) -> dict:
+    """Return the capture.json of an orthographic capture with one light a frame, whose images are 000.exr and so on."""
     height, width = truth.mask.shape
     return {
         "schema": "relit.capture/1",
@@ -114,7 +112,7 @@ def manifest(
         "mask": "mask.png",
         "frames": [
             {
-                "image": image_pattern.format(i),
+                "image": f"{i:03d}.exr",
                 "light": {
                     "type": "distant",
                     "direction": [round(float(x), 8) for x in direction],

@@ -85,8 +85,7 @@ def mitsuba_picture(mi, rig: Rig, shapes: dict, texture: np.ndarray) -> np.ndarr
         "fov_axis": "x",
         "principal_point_offset_x": 0.5 - cu / camera.width,  # of the picture against the principal point, not the other way
         "principal_point_offset_y": 0.5 - cv / camera.height,
-        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb",
-                 "component_format": "float32", "rfilter": {"type": "box"}},
+        "film": rendering.film(camera.width, camera.height),
         "sampler": {"type": "multijitter"},
     })  # fmt: skip
     tracer = rendering.Tracer(mi, shapes, sensor, max_depth=rig_transport.MAX_DEPTH)

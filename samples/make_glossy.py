@@ -19,7 +19,7 @@ import capture_files
 import numpy as np
 import rendering
 from feathers import mix, noise, smoothstep
-from meshing import Surface, gradient, project, subdivide, surface_nets
+from meshing import Surface, gradient, mesh_of
 from scipy.ndimage import binary_erosion
 
 LIGHT_COUNT = 64
@@ -55,10 +55,7 @@ def distance(p: np.ndarray) -> np.ndarray:
 
 def build(*, metal: bool, detail: float = 0.03) -> Surface:
     """Build the object in metres, camera frame; colour and roughness vary smoothly and independently."""
-    points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 5.6], 4 * detail)
-    for _ in range(2):
-        points, faces = subdivide(project(distance, points, step=0.01), faces)
-    points = project(distance, points, step=0.01, rounds=2)
+    points, faces = mesh_of(distance, [-4.9] * 3, [4.9, 4.9, 5.6], detail)
     one, two = (BRASS, STEEL) if metal else (PAINT, GLAZE)
     albedo = mix(one, two, smoothstep(-2.0, 2.0, noise(points, 7.0, seed=2)))
     low, high = ROUGHNESS
@@ -69,23 +66,14 @@ def build(*, metal: bool, detail: float = 0.03) -> Surface:
 
 def principled_mesh(mi, surface: Surface, *, metal: bool):
     """Return the Mitsuba mesh of a surface with the `principled` BSDF."""
-    shape = rendering.mesh(mi, "object", surface)
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict({
+    bsdf = {
         "type": "principled",
         "base_color": {"type": "mesh_attribute", "name": "vertex_albedo"},
         "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
         "metallic": float(metal),
         "specular": SPECULAR,
-    })
-    copy = mi.Mesh("object", len(surface.points), len(surface.faces), props=props, has_vertex_normals=True)
-    for name, size in (("vertex_albedo", 3), ("vertex_f0", 1), ("vertex_roughness", 1)):
-        copy.add_attribute(name, size, mi.traverse(shape)[name])
-    params, source = mi.traverse(copy), mi.traverse(shape)
-    for name in ("vertex_positions", "vertex_normals", "faces"):
-        params[name] = source[name]
-    params.update()
-    return copy
+    }
+    return rendering.mesh_with(mi, "object", surface, bsdf, rendering.materials(surface))
 
 
 def main() -> None:
@@ -119,7 +107,7 @@ def main() -> None:
         print(f"\rlight {i + 1} of {LIGHT_COUNT}, {time.perf_counter() - started:.0f} s", end="", flush=True)
     capture_files.write_json(args.out / "capture.json", capture_files.manifest(
         name="glossy_metal" if args.metal else "glossy", truth=truth, pixel_size_m=pixel_size_m, directions=directions,
-        irradiance=irradiance, image_pattern="{:03d}.exr"))
+        irradiance=irradiance))
     print()
 
 

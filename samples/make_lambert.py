@@ -18,7 +18,7 @@ import capture_files
 import numpy as np
 import rendering
 from feathers import mix, noise, smoothstep
-from meshing import Surface, gradient, project, subdivide, surface_nets, vertex_normals
+from meshing import Surface, gradient, mesh_of, vertex_normals
 from scipy.ndimage import binary_erosion
 
 LIGHT_COUNT = 32
@@ -62,10 +62,7 @@ def distance(p: np.ndarray) -> np.ndarray:
 
 def build(*, detail: float = 0.02) -> Surface:
     """Build the object in metres, camera frame, with two albedos that blend smoothly; `detail` is in centimetres."""
-    points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 6.0], 4 * detail)
-    for _ in range(2):
-        points, faces = subdivide(project(distance, points, step=0.01), faces)
-    points = project(distance, points, step=0.01, rounds=2)
+    points, faces = mesh_of(distance, [-4.9] * 3, [4.9, 4.9, 6.0], detail)
     n = len(points)
     albedo = mix(CLAY, SLATE, smoothstep(-2.0, 2.0, noise(points, 7.0, seed=2)))
     normals = gradient(distance, points, step=0.005)
@@ -145,17 +142,8 @@ def main() -> None:
         differences.append((np.abs(image - expected) / np.maximum(expected, 1e-9))[lit].ravel())
         print(f"\rlight {i + 1} of {LIGHT_COUNT}, {time.perf_counter() - started:.0f} s", end="", flush=True)
     name = "lambert" if args.max_depth == 2 else "lambert_bounce"
-    capture_files.write_json(
-        args.out / "capture.json",
-        capture_files.manifest(
-            name=name,
-            truth=truth,
-            pixel_size_m=pixel_size_m,
-            directions=directions,
-            irradiance=irradiance,
-            image_pattern="{:03d}.exr",
-        ),
-    )
+    capture_files.write_json(args.out / "capture.json", capture_files.manifest(
+        name=name, truth=truth, pixel_size_m=pixel_size_m, directions=directions, irradiance=irradiance))
     difference = np.concatenate(differences)
     size = sum(f.stat().st_size for f in args.out.iterdir())
     median, most = np.quantile(difference, [0.5, 0.99])

@@ -109,17 +109,8 @@ def write_descriptions(args, truth, pixel_size_m: float, directions: np.ndarray,
             "frames": {"spp": args.spp, "max_depth": args.max_depth, "mantissa_bits": args.mantissa_bits},
         },
     )
-    capture_files.write_json(
-        args.out / "capture.json",
-        capture_files.manifest(
-            name="owl",
-            truth=truth,
-            pixel_size_m=pixel_size_m,
-            directions=directions,
-            irradiance=irradiance,
-            image_pattern="{:03d}.exr",
-        ),
-    )
+    capture_files.write_json(args.out / "capture.json", capture_files.manifest(
+        name="owl", truth=truth, pixel_size_m=pixel_size_m, directions=directions, irradiance=irradiance))
 
 
 if __name__ == "__main__":

@@ -39,18 +39,9 @@ def part_mesh(mi, name: str, mesh: part_scenes.PartMesh):
         return {"type": "principled", "base_color": {"type": "mesh_attribute", "name": colour}, "metallic": metallic,
                 "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"}, "specular": SPECULAR, **mesh.beyond}
 
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "blendbsdf", "weight": {"type": "mesh_attribute", "name": "vertex_share"},
-                                  "first": principled("vertex_dielectric", 0.0), "second": principled("vertex_metal", 1.0)})
-    shape = mi.Mesh(name, len(mesh.points), len(mesh.faces), props=props, has_vertex_normals=True)
-    for attribute, values in mesh.paint._asdict().items():
-        shape.add_attribute(f"vertex_{attribute}", values.size // len(mesh.points), values.astype(np.float32).ravel())
-    params = mi.traverse(shape)
-    params["vertex_positions"] = mesh.points.astype(np.float32).ravel()
-    params["vertex_normals"] = mesh.normals.astype(np.float32).ravel()
-    params["faces"] = mesh.faces.astype(np.uint32).ravel()
-    params.update()
-    return shape
+    blend = {"type": "blendbsdf", "weight": {"type": "mesh_attribute", "name": "vertex_share"},
+             "first": principled("vertex_dielectric", 0.0), "second": principled("vertex_metal", 1.0)}
+    return rendering.mesh_with(mi, name, mesh, blend, mesh.paint._asdict())
 
 
 def trace_truth(mi, shapes: dict, *, resolution: int, pixel_size_m: float) -> dict[str, np.ndarray]:
@@ -126,7 +117,7 @@ def main() -> None:
     directions, irradiance = rendering.fibonacci_sphere(count), np.full((count, 3), make_relight_checks.IRRADIANCE)
     truth = capture_files.Truth(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), layers["height.Z"], mask)
     manifest = capture_files.manifest(name=args.object, truth=truth, pixel_size_m=pixel_size_m, directions=directions,
-                                      irradiance=irradiance, image_pattern="{:03d}.exr")
+                                      irradiance=irradiance)
     record = make_relight_checks.Record(args.out / "references.json", {
         "object": {"name": args.object, "parts": list(shapes), "center_m": relight_lights.numbers(center), "radius_m": radius_m,
                    "surface_z_m": manifest["camera"]["surface_z_m"]},

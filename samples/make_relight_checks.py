@@ -149,7 +149,7 @@ def main() -> None:
         truth = truth._replace(mask=binary_erosion(truth.mask, np.ones((3, 3)), iterations=model.mask_erosion))
     directions, irradiance = rendering.fibonacci_sphere(LIGHT_COUNT), np.full((LIGHT_COUNT, 3), IRRADIANCE)
     manifest = capture_files.manifest(name=args.object, truth=truth, pixel_size_m=pixel_size_m, directions=directions,
-                                      irradiance=irradiance, image_pattern="{:03d}.exr")  # fmt: skip
+                                      irradiance=irradiance)  # fmt: skip
     record = Record(args.out / "references.json", {
         "object": {"name": args.object, "center_m": relight_lights.numbers(center), "radius_m": radius_m,
                    "surface_z_m": manifest["camera"]["surface_z_m"]},

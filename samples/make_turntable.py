@@ -74,12 +74,10 @@ def world_from_camera(turn: float, height: float = 0.0) -> np.ndarray:  # -> [4,
 
 def sensor(mi, pose: np.ndarray):
     """Return Mitsuba's camera at a pose, with a box filter."""
-    film = {"type": "hdrfilm", "width": SIZE_PX, "height": SIZE_PX, "pixel_format": "rgb", "component_format": "float32",
-            "rfilter": {"type": "box"}}
     return mi.load_dict({
         "type": "perspective", "fov": float(np.degrees(2 * np.arctan(0.5 * SIZE_PX / FOCAL_PX))), "fov_axis": "x", "near_clip": 0.01,
         "to_world": mi.ScalarTransform4f(pose @ np.diag([-1.0, 1.0, -1.0, 1.0])),  # its devices look along +z with +x to their left
-        "film": film, "sampler": {"type": "multijitter"}})
+        "film": rendering.film(SIZE_PX, SIZE_PX), "sampler": {"type": "multijitter"}})
 
 
 def covered(mi, scene, pose: np.ndarray) -> np.ndarray:  # -> [rows, cols] bool

@@ -93,6 +93,14 @@ def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
+def mesh_of(distance: Distance, lower, upper, edge: float, *, step: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points and faces of the zero level of `distance` inside a box, with edges of about `edge`; `step`: of the gradients."""
+    points, faces = surface_nets(distance, lower, upper, 4 * edge)
+    for _ in range(2):
+        points, faces = subdivide(project(distance, points, step=step), faces)
+    return project(distance, points, step=step, rounds=2), faces
+
+
 def grid_faces(rows: int, columns: int) -> np.ndarray:
     """Return the faces of a rows x columns vertex grid that wraps in columns; outside is to the right of increasing rows."""
     r, c = np.mgrid[: rows - 1, :columns]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import feathers as fe
 import numpy as np
-from meshing import Surface, gradient, project, subdivide, surface_nets, vertex_normals
+from meshing import Surface, gradient, mesh_of, vertex_normals
 
 # Linear Rec.709 albedo.
 CREAM = np.array([0.74, 0.62, 0.44])
@@ -168,11 +168,7 @@ def _face(p: np.ndarray):
 
 def plumage_surface(detail: float) -> Surface:
     """Build the feathered mesh; `detail` is its final edge length in centimetres."""
-    coarse = 4 * detail
-    points, faces = surface_nets(plumage, [-6.6, -10.5, -6.2], [6.6, 11.6, 6.4], coarse)
-    for _ in range(2):
-        points, faces = subdivide(project(plumage, points, step=0.02), faces)
-    points = project(plumage, points, step=0.02, rounds=2)
+    points, faces = mesh_of(plumage, [-6.6, -10.5, -6.2], [6.6, 11.6, 6.4], detail, step=0.02)
     lift, albedo, rough = _coat(points)
     points = points + lift[:, None] * gradient(plumage, points, step=0.05)
     return Surface(points, faces, vertex_normals(points, faces), albedo, np.full(len(points), 0.04), rough)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from feathers import mix, noise, smoothstep
-from meshing import Distance, gradient, project, subdivide, surface_nets
+from meshing import Distance, gradient, mesh_of
 
 FIELD_M = 0.2
 """Side of the square that the camera sees."""
@@ -49,10 +49,7 @@ class PartMesh(NamedTuple):
 
 def build(part: Part, *, detail: float) -> PartMesh:
     """Mesh a part with edges of about `detail` centimetres."""
-    points, faces = surface_nets(part.distance, part.lower, part.upper, 4 * detail)
-    for _ in range(2):
-        points, faces = subdivide(project(part.distance, points, step=0.01), faces)
-    points = project(part.distance, points, step=0.01, rounds=2)
+    points, faces = mesh_of(part.distance, part.lower, part.upper, detail)
     return PartMesh(points * CM, faces, gradient(part.distance, points, step=0.005), part.paint(points), part.beyond)
 
 

@@ -86,16 +86,15 @@ def camera(mi, *, resolution: int, pixel_size_m: float) -> dict:
         "near_clip": 0.01,
         "far_clip": 10.0,
         "to_world": look @ mi.ScalarTransform4f().scale([half_width, half_width, 1.0]),
-        "film": {
-            "type": "hdrfilm",
-            "width": resolution,
-            "height": resolution,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
+        "film": film(resolution, resolution),
         "sampler": {"type": "multijitter"},  # half the noise of independent samples at 256 a pixel
     }
+
+
+def film(width: int, height: int) -> dict:
+    """Return a film of linear float values with a box filter."""
+    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32",
+            "rfilter": {"type": "box"}}
 
 
 def mesh(mi, name: str, surface, *, lambertian: bool = False) -> Any:
@@ -110,12 +109,22 @@ def mesh(mi, name: str, surface, *, lambertian: bool = False) -> Any:
         "f0": {"type": "mesh_attribute", "name": "vertex_f0"},
         "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
     }
+    return mesh_with(mi, name, surface, {"type": "diffuse", "reflectance": albedo} if lambertian else coat, materials(surface))
+
+
+def materials(surface) -> dict[str, np.ndarray]:
+    """Return the materials of a `Surface` as `mesh_with` takes them."""
+    return {"albedo": surface.albedo, "f0": surface.f0, "roughness": surface.roughness}
+
+
+def mesh_with(mi, name: str, surface, bsdf: dict, attributes: dict[str, np.ndarray]) -> Any:
+    """Turn points, faces and normals into a Mitsuba mesh with a BSDF, which reads attributes of the vertices, [V] or [V, 3], by
+    `vertex_` and their names."""
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": albedo} if lambertian else coat)
+    props["bsdf"] = mi.load_dict(bsdf)
     shape = mi.Mesh(name, len(surface.points), len(surface.faces), props=props, has_vertex_normals=True)
-    shape.add_attribute("vertex_albedo", 3, surface.albedo.astype(np.float32).ravel())
-    shape.add_attribute("vertex_f0", 1, surface.f0.astype(np.float32).ravel())
-    shape.add_attribute("vertex_roughness", 1, surface.roughness.astype(np.float32).ravel())
+    for attribute, values in attributes.items():
+        shape.add_attribute(f"vertex_{attribute}", values.size // len(surface.points), values.astype(np.float32).ravel())
     params = mi.traverse(shape)
     params["vertex_positions"] = surface.points.astype(np.float32).ravel()
     params["vertex_normals"] = surface.normals.astype(np.float32).ravel()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import feathers as fe
 import numpy as np
-from meshing import Surface, bezier, gradient, project, sphere, subdivide, surface_nets, tube, vertex_normals
+from meshing import Surface, bezier, gradient, mesh_of, sphere, tube, vertex_normals
 from owl_plumage import DARK, from_head, plumage_surface, rotation
 
 METRES = 0.00915  # per unit of this file: the figurine stands 0.2 m tall
@@ -104,10 +104,7 @@ def stump_distance(p: np.ndarray) -> np.ndarray:
 
 def stump_surface(detail: float) -> Surface:
     """Build the stump: furrowed bark, pale rings on top, moss."""
-    points, faces = surface_nets(stump_distance, [-6, -11.4, -6], [6, -6.6, 6], 4 * detail)
-    for _ in range(2):
-        points, faces = subdivide(project(stump_distance, points, step=0.02), faces)
-    points = project(stump_distance, points, step=0.02, rounds=2)
+    points, faces = mesh_of(stump_distance, [-6, -11.4, -6], [6, -6.6, 6], detail, step=0.02)
     normal = gradient(stump_distance, points, step=0.05)
     angle = np.arctan2(points[:, 0], points[:, 2])
     bark = fe.smoothstep(0.75, 0.45, normal[:, 1])
