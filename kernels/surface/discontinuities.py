@@ -129,18 +129,12 @@ def loop_noise(slopes: Slopes, *, grid: Grid) -> float:
     return MAD_TO_SIGMA * float(np.sqrt(np.median(loops))) if loops.size else 0.0
 
 
-def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
-    """Return the same slopes of all pairs of neighbours, with lower weights for edges across contradictions; `noise` is of loop_noise."""
-    lowered = slopes._replace(weights=grid.no_edges())
-    run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
-    return lowered
-
-
 def find_breaks(slopes: Slopes, surface: NormalMap, kind: np.ndarray | None, *, grid: Grid, spacing: float) -> Breaks:
     """Cut a surface where its normals turn abruptly or contradict each other, or its kind [rows, cols] changes; reads slopes and weights
     back to the host. `slopes` are of all pairs of neighbours, `spacing` is their mean distance in the plane of x and y."""
     noise = loop_noise(slopes, grid=grid)
-    lowered = distrust_loops(slopes, noise=noise, grid=grid)
+    lowered = slopes._replace(weights=grid.no_edges())
+    run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
     whole, left = ((to_numpy(w.right), to_numpy(w.down)) for w in (slopes.weights, lowered.weights))
     found = cut(surface, kind, (to_numpy(slopes.right), to_numpy(slopes.down)), whole, left, grid=grid, spacing=spacing)
     return Breaks(lowered, noise, found, np.where(found.way == 1, left[1][found.first], left[0][found.first]))

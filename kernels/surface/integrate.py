@@ -135,7 +135,7 @@ def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -
     """Take edges away, in place; `cuts`: [rows, cols] bool, edges to the right and edges down."""
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
         kept = to_numpy(plane)
-        kept[: grid.pitch * (grid.rows + 2)].reshape(-1, grid.pitch)[1 : grid.rows + 1, 1 : grid.cols + 1][cut] = 0
+        grid.pixels(kept)[cut] = 0
         plane.assign(kept)
 
 

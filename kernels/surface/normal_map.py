@@ -125,13 +125,6 @@ def _mark_usable(first: int,
         usable[r, c] = wp.uint8(0)
 
 
-def _usable_pixels(normal: wp.array, mask: wp.array, x: wp.array, y: wp.array, *, device: str) -> wp.array:
-    """Return the pixels that take part, [rows, cols] uint8: in the mask, with a finite normal of some length."""
-    usable = wp.empty(mask.shape, dtype=wp.uint8, device=device)
-    devices.launch(_mark_usable, mask.shape[0] * mask.shape[1], [normal, mask, x, y], [usable], device=device)
-    return usable
-
-
 class NormalMap:
     """Normals with their pixels' places and standard errors.
 
@@ -163,7 +156,9 @@ class NormalMap:
             part = slice(first, min(first + step, self.rows) + 1)
             normal, x, y = self._floats(self._normal[:, part]), self._floats(self._x[part]), self._floats(self._y[part])
             inside = np.ascontiguousarray((self._mask[part] != 0).view(np.uint8))
-            usable = _usable_pixels(normal, wp.array(inside, dtype=wp.uint8, device=self.device), x, y, device=self.device)
+            usable = wp.empty(inside.shape, dtype=wp.uint8, device=self.device)
+            devices.launch(_mark_usable, inside.size, [normal, wp.array(inside, dtype=wp.uint8, device=self.device), x, y], [usable],
+                           device=self.device)
             rows = min(step, self.rows - first)
             if self._sigma is None:
                 yield NormalBand(first, rows, normal, usable, x, y, wp.ones(inside.shape, dtype=wp.float32, device=self.device))

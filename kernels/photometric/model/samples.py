@@ -206,16 +206,7 @@ def device_values(samples: Samples, values: np.ndarray) -> wp.array:
 
 def readings_of(samples: Samples) -> np.ndarray:
     """Return [n, lights] grey readings radiance over irradiance; below 0 where there is none; waits for the device."""
-    values, level = to_numpy(samples.grey).reshape(_planes(samples)), to_numpy(samples.level)
-    scaled = values * level[:, None] if samples.light_stride == 1 else values * level
-    pixels_last = scaled.transpose(1, 0, 2) if samples.light_stride == 1 else scaled
-    return pixels_last.reshape(samples.light_count, -1).T[: samples.pixel_count]
-
-
-def _planes(samples: Samples) -> tuple[int, int, int]:
-    """Return the shape of readings on the host: packs, lights and lanes where the lights of a pack follow each other."""
-    lights, packs = samples.light_count, samples.packs
-    return (packs, lights, samples.lanes) if samples.light_stride == 1 else (lights, packs, samples.lanes)
+    return np.asfortranarray(host_values(samples, samples.grey) * to_host(samples, samples.level)[:, None])
 
 
 @once

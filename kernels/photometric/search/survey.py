@@ -43,21 +43,15 @@ def evidence(samples: Samples, cost: np.ndarray, weights: np.ndarray) -> Evidenc
     """Return what fits of sampled pixels, of cost [n] per light and mixture [n, lobes], leave unexplained; waits for the device."""
     unknowns = DIRECTION + (weights > USED).sum(axis=1)
     total = cost.astype(np.float64) * samples.light_count
-    surplus = np.maximum(_informative(samples) - unknowns, 0)
+    informative = wp.empty(samples.packs, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    devices.launch(_count_kernel(samples.lanes), samples.packs, [samples.arrays], [informative], device=samples.device)
+    surplus = np.maximum(to_host(samples, informative) - unknowns, 0)
     return Evidence(total, surplus, noise_of(total, surplus))
 
 
 def noise_of(total: np.ndarray, surplus: np.ndarray) -> np.ndarray:
     """Return the cost of a reading beyond the unknowns, [n], where all cost [n] and so many could have contradicted the fit, [n]."""
     return np.asarray((total + EXPECTED_COST * PSEUDO_READINGS) / (surplus + PSEUDO_READINGS))
-
-
-def _informative(samples: Samples) -> np.ndarray:
-    """Return [n] the number of readings that are not shadow."""
-    counts = wp.empty(samples.packs, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
-    devices.launch(_count_kernel(samples.lanes), samples.packs,
-                   [samples.arrays], [counts], device=samples.device)
-    return to_host(samples, counts)
 
 
 @once
