@@ -188,8 +188,11 @@ def table(counts: Counter[str], done: int, peak_kb: int, faults: Sequence[str]) 
         "| file | cases | read all the same | refused by name | faults |", "|---|---|---|---|---|", *rows])
 
 
-def write_between(document: Path, start: str, end: str, text: str) -> None:
-    """Replace what stands between two lines of a document."""
+def write_between(document: Path | None, start: str, end: str, text: str) -> None:
+    """Replace what stands between two lines of a document, or print the text where there is none."""
+    if document is None:
+        print(text)
+        return
     before, mark, rest = document.read_text().partition(f"{start}\n")
     if not mark or end not in rest:
         sys.exit(f"{document} lacks the lines {start} and {end}")

@@ -52,11 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, help="the document that the table goes into")
     arguments = parser.parse_args()
-    made = table()
-    if arguments.write is None:
-        print(made)
-        return
-    write_between(arguments.write, START, END, made)
+    write_between(arguments.write, START, END, table())
 
 
 if __name__ == "__main__":

@@ -126,10 +126,7 @@ def main() -> None:
     made = "\n".join([
         f"18 scans of {given.rows * 3 // 4} × {given.rows} pixels, {points} points each; voxels of {given.voxel_mm:g} mm.\n", HEAD,
         by_relit(views, given.voxel_mm * MM, given.device), by_open3d(given.open3d, views, given.voxel_mm * MM)])
-    if given.write is None:
-        print(made)
-    else:
-        write_between(given.write, START, END, made)
+    write_between(given.write, START, END, made)
 
 
 if __name__ == "__main__":

@@ -154,9 +154,6 @@ def main() -> None:
     made = table(arguments.rows, arguments.open3d)
     if arguments.trials:
         made += "\n\n" + trials(arguments.trials, arguments.trial_rows)
-    if arguments.write is None:
-        print(made)
-        return
     write_between(arguments.write, START, END, made)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.trials.trial import Trial
+from benchmarks.trials.trial import Trial, range_trial
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
 
@@ -136,12 +136,8 @@ def solved(case: Case, seed: int = 20) -> Trial:
         camera = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [FOCAL_PX, FOCAL_PX]}
         (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "room", "camera": camera, "frames": frames}))
         result = depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
-    maps = result.maps
-    assert maps.range is not None and maps.sigma is not None and maps.confidence is not None
-    along = maps.depth / np.maximum(maps.range, 1e-9)
-    return Trial(case.name, case.in_model, 1000 * np.abs(maps.range - truth).ravel(),
-                 1000 * (maps.sigma / np.where(along > 0, along, 1)).ravel(), maps.confidence.ravel().astype(np.float64),
-                 maps.mask.ravel(), "mm", " ".join(result.warnings))
+    assert result.maps.range is not None
+    return range_trial(case.name, case.in_model, np.abs(result.maps.range - truth).ravel(), result)
 
 
 def trials(data: Path | None) -> Iterator[Trial]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.trials.continuous import LIGHT_M_S, RAYS, room
-from benchmarks.trials.trial import Trial
+from benchmarks.trials.trial import Trial, range_trial
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest, TofOptions
 
@@ -162,14 +162,11 @@ def solved(case: Case, seed: int = 30) -> Trial:
                 "time_s": times[::4].tolist(), "power": power[::4].tolist()}}))
             options["calibration"] = folder / "camera.json"
         result = depth(DepthRequest(capture=folder, out=folder / "out", tof=TofOptions.model_validate(options), device="cpu"))
-    maps = result.maps
-    assert maps.range is not None and maps.sigma is not None and maps.confidence is not None
-    along = maps.depth / np.maximum(maps.range, 1e-9)
-    error = np.abs(maps.range.ravel() - truth)
+    assert result.maps.range is not None
+    error = np.abs(result.maps.range.ravel() - truth)
     if case.glass:
-        error = np.minimum(error, np.abs(maps.range.ravel() - 0.6))  # the pane is a return too
-    return Trial(case.name, case.in_model, 1000 * error, 1000 * (maps.sigma / np.where(along > 0, along, 1)).ravel(),
-                 maps.confidence.ravel().astype(np.float64), maps.mask.ravel(), "mm", " ".join(result.warnings))
+        error = np.minimum(error, np.abs(result.maps.range.ravel() - 0.6))  # the pane is a return too
+    return range_trial(case.name, case.in_model, error, result)
 
 
 def _write(folder: Path, counts: np.ndarray, light: dict[str, Any]) -> None:
