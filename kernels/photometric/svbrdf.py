@@ -33,7 +33,7 @@ from kernels.photometric.material.material import (
 from kernels.photometric.material.metal_search import Metals, moved, search_metals
 from kernels.photometric.material.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.model.candidates import rings
-from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.chosen_samples import choose, put
 from kernels.photometric.model.samples import Samples, to_host
 from kernels.photometric.search.certainty import SingleLobe, standard_deviation
 from kernels.photometric.search.descent import WARM, descend
@@ -114,8 +114,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: LobeShape, lobe:
             moved = np.flatnonzero((better != normal).any(axis=1))
             if len(moved):
                 again = fit_material(choose(samples, moved), better[moved], shape=lobe, shared=shared)
-                for plane, replaced in zip(material, again, strict=True):
-                    plane[moved] = replaced
+                put(material, moved, again)
                 spread = np.hypot(spread, _angles(normal, better))
                 normal = better
     else:

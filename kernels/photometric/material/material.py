@@ -29,7 +29,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.material.material_kernel import GIVEN, GIVEN_F0, METALLIC, NEUTRAL, TINTED, material_kernel
-from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.chosen_samples import choose, either, put
 from kernels.photometric.model.lobes import direction_reflectance
 from kernels.photometric.model.response_table import COLUMNS
 from kernels.photometric.model.robust_weights import WEIGHT_ROWS
@@ -120,7 +120,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: LobeShape, opti
     cold = _fit(few, there, shape, options, None, NEUTRAL, np.full(4, BRIGHTEST_DIELECTRIC), anew=True)
     one_f0 = [fit_given_f0(few, there, f0, shape=shape) for f0 in common]
     again = _reconcile(_pick(own, doubtful), cold, one_f0, _pick(blend, doubtful), common)
-    _put(found, doubtful, again)
+    put(found, doubtful, again)
     return found
 
 
@@ -197,7 +197,7 @@ def _fit_metallic(samples: Samples, normal: np.ndarray, own: Material, tinted: M
         found = _fit(choose(samples, at), normal[at], shape, None, None, METALLIC, np.full(4, f0))
         better = (found.cost < own.cost[at]) & (found.cost <= NEUTRAL_RISE * tinted.cost[at] + COST_FLOOR)
         at = at[better]
-        _put(own, at, _pick(found, np.flatnonzero(better)))
+        put(own, at, _pick(found, np.flatnonzero(better)))
     return np.isin(np.arange(len(tried)), at)
 
 
@@ -214,12 +214,6 @@ def _reconcile(own: Material, cold: Material, one_f0: list[Material], blend: Mat
     return _where(explains(blend, own), blend, found)
 
 
-def _put(material: Material, positions: np.ndarray, values: Material) -> None:
-    """Replace the material of some pixels."""
-    for plane, replaced in zip(material, values, strict=True):
-        plane[positions] = replaced
-
-
 def _pick(material: Material, positions: np.ndarray) -> Material:
     """Return the material of some pixels."""
     return Material(*(plane[positions] for plane in material))
@@ -227,7 +221,7 @@ def _pick(material: Material, positions: np.ndarray) -> Material:
 
 def _where(first: np.ndarray, a: Material, b: Material) -> Material:
     """Return the first material where `first` is true, else the second."""
-    return Material(*(np.where(first if x.ndim == 1 else first[:, None], x, y) for x, y in zip(a, b, strict=True)))
+    return Material(*either(first, a, b))
 
 
 def _blend(fits: list[Material]) -> Material:

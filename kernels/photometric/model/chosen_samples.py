@@ -1,6 +1,7 @@
-"""The samples of some of the sampled pixels, which are copied on their device."""
+"""The samples of some of the sampled pixels, which are copied on their device, and results of some pixels put among those of all."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,17 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.model.samples import Samples
+
+
+def put(whole: Iterable[np.ndarray], where: np.ndarray, part: Iterable[np.ndarray]) -> None:
+    """Replace the results of some pixels, field by field, in place."""
+    for values, replaced in zip(whole, part, strict=True):
+        values[where] = replaced
+
+
+def either(first: np.ndarray, a: Iterable[np.ndarray], b: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """Return one result of all pixels, field by field, where `first` [n] is true, else the other."""
+    return [np.where(first if x.ndim == 1 else first[:, None], x, y) for x, y in zip(a, b, strict=True)]
 
 
 def choose(samples: Samples, chosen: np.ndarray) -> Samples:

@@ -44,11 +44,6 @@ class Modes(NamedTuple):
         """Return modes of pixels that are not judged yet."""
         return cls(np.zeros((pixels, 3), np.float32), *(np.zeros(pixels, np.float32) for _ in range(4)))
 
-    def place(self, chosen: np.ndarray, found: "Modes") -> None:
-        """Store the modes of chosen pixels, [n] bool."""
-        for whole, part in zip(self, found, strict=True):
-            whole[chosen] = part
-
     def close_to(self, normal: np.ndarray) -> np.ndarray:
         """Return [n] bool whether these normals of least cost, [n, 3], are kept: they lie within KEPT standard deviations of the mean."""
         return angle_degrees(normal, self.normal) < KEPT * self.sigma

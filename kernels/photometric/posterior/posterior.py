@@ -19,7 +19,7 @@ import warp as wp
 
 from kernels.device import once, to_numpy
 from kernels.photometric.model.candidates import LEAST_NZ
-from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.chosen_samples import choose, put
 from kernels.photometric.model.response_table import nodes
 from kernels.photometric.model.samples import Samples, evenly, readings_of, to_host
 from kernels.photometric.posterior.scores import score_normals
@@ -153,8 +153,7 @@ def normal_posterior(group: Group, noise: Noise) -> Posterior:
             break
         again, moved[far] = _around(Group(choose(group.samples, far), group.model, found.normal[far]), noise)
         moved[~far] = 0
-        for whole, part in zip(found, again, strict=True):
-            whole[far] = part
+        put(found, far, again)
     return found
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from kernels.photometric.material.material import Material, fit_material
-from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.chosen_samples import choose, either, put
 from kernels.photometric.model.response_table import POSTERIOR_WIDTHS, SEARCH_WIDTHS, SPECULAR_SCALE, search_table
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.posterior.modes import Modes, find_modes, weigh
@@ -111,8 +111,8 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
                 for table in tables.search]
     materials = [fit_material(samples, search.normal, shape=lambert, options=OPTIONS, table=tables.responses) for search in searches]
     metallic = materials[1].cost < materials[0].cost
-    material = Material(*_choose(metallic, *materials))
-    normal, cost, weights = _choose(metallic, *((search.normal, search.cost, search.weights) for search in searches))
+    material = Material(*either(metallic, *reversed(materials)))
+    normal, cost, weights = either(metallic, *((search.normal, search.cost, search.weights) for search in reversed(searches)))
     return Found(normal, other, metallic, weights, cost, *material[:3])
 
 
@@ -131,22 +131,16 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
     for kind, group in zip(kinds, groups, strict=True):
         other = search_normals(group.samples, found.other[metallic == kind], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0],
                                fine=AROUND[1:], table=tables.search[kind]).normal
-        modes.place(metallic == kind, weigh(normal_posterior(group, noise), normal_posterior(group._replace(normal=other), noise)))
+        put(modes, metallic == kind, weigh(normal_posterior(group, noise), normal_posterior(group._replace(normal=other), noise)))
     kept = modes.close_to(found.normal)
     normal = np.where(kept[:, None], found.normal, modes.normal)
     if not kept.all():
         again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=OPTIONS, table=tables.responses)
-        for values, better in zip(material, again, strict=True):
-            values[~kept] = better
+        put(material, ~kept, again)
     facing = (normal * view).sum(axis=1)
     return SamplingFit(normal, material.diffuse_albedo, material.specular, material.roughness,
                        regimes(found.weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
                        modes.spread, np.sqrt(found.cost))
-
-
-def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """Return the second of two results, field by field, where it is better, else the first."""
-    return [np.where(second if x.ndim == 1 else second[:, None], y, x) for x, y in zip(a, b, strict=True)]
 
 
 def regimes(weights: np.ndarray, f0: np.ndarray, facing: np.ndarray, material: Material) -> np.ndarray:
