@@ -56,7 +56,7 @@ def best_f0(folder: Path, models: tuple[Fresnel, ...]) -> list[tuple[float, floa
     albedo = np.stack([plane(f"diffuse_albedo.{c}") for c in "RGB"], axis=1)
     rough, nv = plane("roughness.Y"), normal[:, 2]
     alpha2 = rough**4
-    costs, count = np.zeros((len(models), len(F0_GRID))), 0
+    costs = np.zeros((len(models), len(F0_GRID)))
     for frame, toward, irradiance in zip(capture.manifest.frames, lights.direction, lights.irradiance, strict=True):
         lit = normal @ toward > LEAST_LIGHT
         image, _ = exr.read(folder / frame.image)
@@ -70,7 +70,6 @@ def best_f0(folder: Path, models: tuple[Fresnel, ...]) -> list[tuple[float, floa
         retro = 2 * rough[lit] * hv**2 - 0.5
         diffuse = nl / np.pi * (1 + retro * (1 - nl) ** 5) * (1 + retro * (1 - seen) ** 5)  # Burley 2012
         left, noise = radiance - albedo[lit] * diffuse[:, None], NOISE * (1 + radiance)
-        count += int(lit.sum())
         for place, model in enumerate(models):
             for column, f0 in enumerate(F0_GRID):
                 off = (left - (lobe * model(float(f0), np.array(hv)))[:, None]) / noise

@@ -42,12 +42,12 @@ def trials(data: Path | None) -> Iterator[Trial]:
     sphere, disc = ellipsoid(96, 1.0)
     for ball, name, right in ((PLASTIC, "plastic", True), ((0.0, 0.3, 0.8), "metal", False)):
         with tempfile.TemporaryDirectory() as folder:
-            write(Path(folder) / "ball", sphere, disc, under_lights(sphere[disc], directions, ball), lights)
+            write(Path(folder) / "ball", disc, under_lights(sphere[disc], directions, ball), lights)
             radiance = under_lights(normal[mask], directions, PLASTIC)
             yield solved(f"reference, plastic with a {name} ball", right, normal, mask, radiance, lights,
                          method=Method.REFERENCE, reference_ball=Path(folder) / "ball")
     with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder) / "ball", sphere, disc, under_lights(sphere[disc], directions, (0.6, 1.0, 0.0)), lights)
+        write(Path(folder) / "ball", disc, under_lights(sphere[disc], directions, (0.6, 1.0, 0.0)), lights)
         toward = np.broadcast_to(directions[:, None], (len(directions), int(mask.sum()), 3))
         radiance = 0.5 / np.pi * np.stack([reflect("velvet", normal[mask], way) for way in toward], axis=1)
         yield solved("reference, velvet with a matt ball", False, normal, mask, np.repeat(radiance[..., None], 3, axis=2), lights,
@@ -60,7 +60,7 @@ def solved(name: str, in_model: bool, normal: np.ndarray, mask: np.ndarray, radi
     rng = np.random.default_rng(4)
     noisy = radiance * (1 + NOISE * rng.normal(size=radiance.shape)) + DARK_NOISE * radiance.max() * rng.normal(size=radiance.shape)
     with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder), normal, mask, noisy, lights)
+        write(Path(folder), mask, noisy, lights)
         result = solve(SolveRequest(capture=Path(folder), out=Path(folder) / "out", cache=Path(folder) / "cache", **options))
     maps = result.maps
     return Trial(name, in_model, angles_deg(maps.normal[mask], normal[mask]), maps.sigma[mask], maps.confidence[mask],
@@ -161,7 +161,7 @@ def under_lights(normal: np.ndarray, directions: np.ndarray, material: Material)
     return np.repeat(value[..., None], 3, axis=2)
 
 
-def write(folder: Path, normal: np.ndarray, mask: np.ndarray, radiance: np.ndarray, lights: list[dict[str, Any]]) -> None:
+def write(folder: Path, mask: np.ndarray, radiance: np.ndarray, lights: list[dict[str, Any]]) -> None:
     """Write a capture of the masked pixels."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
