@@ -26,6 +26,7 @@ from service.scans.register import register_scans
 from stage.formats.images import pixels_of
 from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import DISTANCE_M, MM, View, figure, turntable
+from tests.service.scans.mesh_files import read_faces
 
 TARGET = Path(__file__).parents[1] / "docs" / "scans.png"
 HEIGHT, WIDTH, FINER = 400, 300, 2
@@ -164,15 +165,6 @@ def of_scans(scans: list[np.ndarray], look: Look, *, only: float | None = None) 
     return drawn(look, points + shuffled[:, None] * look.axes()[2], shown, dot=3)
 
 
-def triangles(path: Path) -> np.ndarray:
-    """Return the faces of a mesh that `relit fuse` wrote."""
-    data = path.read_bytes()
-    head, _, body = data.partition(b"end_header\n")
-    count = int(head.split(b"element face ")[1].split()[0])
-    kind = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-    return np.asarray(np.frombuffer(body[len(body) - count * kind.itemsize:], dtype=kind)["corners"])
-
-
 def by_open3d(python: str, views: list[View], poses: list[np.ndarray], voxel_m: float, folder: Path) -> Mesh:
     """Fuse the same scans with Open3D in another interpreter."""
     np.savez(folder / "shots.npz", depth=np.stack([view.depth for view in views]), pose=np.stack(poses),
@@ -211,7 +203,7 @@ def main() -> None:
         fused = fuse(FuseRequest(scan_set=found.scan_set_path, out=Path(work) / "fused", voxel_m=MM * given.voxel_mm, texture=False,
                                  device="cpu"))
         assert fused.mesh_path is not None
-        mesh = Mesh(applied(motion, read_ply_points(fused.mesh_path).points), triangles(fused.mesh_path))
+        mesh = Mesh(applied(motion, read_ply_points(fused.mesh_path).points), read_faces(fused.mesh_path))
         poses = [motion @ pose for pose in relative]
         other = None if given.open3d is None else by_open3d(given.open3d, views, poses, MM * given.voxel_mm, Path(work))
     own = [view.camera.points(-view.depth)[view.mask].astype(np.float64) for view in views]
