@@ -97,7 +97,7 @@ def main() -> None:
 
     def report(what: str, error: float, limit: float, cause: str) -> None:
         print(f"{'ok  ' if error <= limit else 'FAIL'} {what}: {error:.2e} (limit {limit:g}: {cause})")
-        if error > limit:
+        if not error <= limit:
             failed.append(what)
 
     for name, direction in (("+x", [1, 0, 0]), ("+y", [0, 1, 0]), ("oblique", [-0.48, 0.36, 0.8])):
