@@ -154,12 +154,8 @@ def _by_normals(directions: np.ndarray, normals: Sequence[np.ndarray | None]) ->
 
 def _rims(points: np.ndarray, towards: np.ndarray) -> float:
     """Return the mean cosine between normals at the borders of a surface, turned towards the scanner, and the way out over the border.
-
-    `towards` [n, 3] is the direction from each point to the scanner.
-
-
-    Where a body hides its own back its normals lean outwards; seen from the back they would lean inwards.
-    """
+    `towards` [n, 3]: the direction from each point to the scanner. Where a body hides its own back its normals lean outwards; seen from
+    the back they would lean inwards."""
     distance, index = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
     around = points[index] - points[:, None]
     mean = around.mean(axis=1)
