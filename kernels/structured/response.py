@@ -109,10 +109,11 @@ def phase_table(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray, perio
     return turned
 
 
-def wave_error(response: Sequence[float] | np.ndarray, weights: np.ndarray, shifts: np.ndarray) -> float:
-    """Return the RMS error, in radians, of a phase that is fitted as if the projector were linear."""
-    curve, _ = fitted_curve(bent_wave(response), weights, shifts)
-    off = np.angle(curve * np.exp(-2j * np.pi * np.arange(GRID) / GRID))
+def wave_error(response: Sequence[float] | np.ndarray, weights: np.ndarray, shifts: np.ndarray,
+               taken: Sequence[float] | None = None) -> float:
+    """Return the RMS error, in radians, of a phase that is fitted as if the projector had the response that is taken; None: linear."""
+    curve, other = (fitted_curve(bent_wave(each), weights, shifts)[0] for each in (response, taken))
+    off = np.angle(curve * other.conj())
     return float(np.sqrt(np.mean(off**2)))
 
 

@@ -44,7 +44,8 @@ class PatternProjector(NamedTuple):
     response: tuple[float, ...] | None = None
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
     exponent: float = 1.0
-    """The exponent γ of light = level^γ that the waves show though no response is given: their error is added to the deviation."""
+    """The exponent γ of light = level^γ that the waves show, or of light = response^γ where one is given: their error is added to the
+    deviation."""
     left_rad: float | None = None
     """The error of a phase that is left when waves are bent back by the exponent; None: they are not bent back."""
     changed: float = 0.0
@@ -70,18 +71,20 @@ class PatternProjector(NamedTuple):
     @property
     def wave_response(self) -> Sequence[float] | None:
         """Return the response by which waves are bent back, declared or found; None: none."""
-        if self.response is None and self.left_rad is not None:
-            return tuple((np.linspace(0, 1, 256)**self.exponent).tolist())
-        return self.response
+        return self.response if self.left_rad is None else tuple(self.shown_light(self.exponent).tolist())
+
+    def shown_light(self, exponent: float) -> np.ndarray:
+        """Return the light at 256 even levels from 0 to 1 where it is the declared light to the power of an exponent, [256]."""
+        return np.asarray(light_of(self.response, np.linspace(0, 1, 256))**exponent)
 
     def wave_error(self, shifts: Sequence[float], period_px: float) -> float:
         """Return the RMS error in radians of a phase that is fitted to waves of the exponent, or in changed light, as if to others."""
-        if self.response is not None or self.exponent == 1.0:
+        if self.exponent == 1.0:
             return CHANGED_RAD * self.changed
         if self.left_rad is not None:
             return self.left_rad
         own = np.array(shifts)
-        return wave_error(np.linspace(0, 1, 256)**self.exponent, weights(own, period_px), own)
+        return wave_error(self.shown_light(self.exponent), weights(own, period_px), own, self.response)
 
 
 @dataclass(frozen=True)

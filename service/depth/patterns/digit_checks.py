@@ -13,8 +13,8 @@ from stage.patterns.kary import KaryCode, number_of
 
 LEFT_JUMPS = 0.1
 """Jumps, as a part of all steps, below which stripes of k-ary digits follow each other."""
-EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
-"""Exponents of light = level^γ that are compared."""
+EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6, 3.6, 4.84)
+"""Exponents of light = level^γ that are compared; 2.2² where the response of 2.2 is declared inversely."""
 BENT_LEFT, LEAST_BENT = 0.65, 0.02
 """Part of the mean distance of readings from the levels of digits, of white, that levels of another exponent leave, and least distance,
 from which on that exponent is named: noise, blur and bounced light leave more with any other."""
@@ -43,10 +43,11 @@ def check_digits(sample: Sample, code: KaryCode, collected: Collected, projector
         clear = clear | also
         others.append(("red and blue are exchanged: check the order of the channels in the images", turned, code.reflected))
     lit = sample.lit(sample.grey, noise) & (deviation * CLEAR_SIGMAS < gap / 2)
-    if code.colors is None and projector.response is None and lit.sum() >= ENOUGH:
+    if code.colors is None and lit.sum() >= ENOUGH:
         bent = _exponent_of(part[len(part) // 2 :, 0, lit], levels[:, 0])
         if bent is not None:
-            return (f"the digits of the {code.axis} kary code look like light = level^{bent:g}: give the light that is shown as levels, or "
+            like = "light = level" if projector.response is None else "the light of projector.response"
+            return (f"the digits of the {code.axis} kary code look like {like}^{bent:g}: give the light that is shown as levels, or "
                     "measure projector.response with relit calibrate response; check color_space of the images too")
     read_well = np.flatnonzero(clear[: 1 + len(digits) // 2, lit].sum(axis=1) >= READ_SHARE * max(int(lit.sum()), 1))
     if not len(read_well):

@@ -199,8 +199,8 @@ def checked(sample: Sample, codes: PatternCodes, shown: PatternProjector, projec
     wrong = wrong or waves.wrong
     if wrong is not None:
         return Checks([wrong], codes, False)
-    bent = shown if shown.response is not None else bent_back(sample, codes.collected, shown, noise) or find_exponent(
-        sample, codes.collected, shown, noise)
+    bent = bent_back(sample, codes.collected, shown, noise) or find_exponent(
+        sample, codes.collected, shown, noise, steady=changed is None)
     uneven = uneven_halves(sample, codes.collected, measured)
     said = [sentence for sentence in (waves.unconfirmed, changed, uneven) if sentence is not None]
     names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]

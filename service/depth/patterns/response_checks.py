@@ -26,8 +26,8 @@ from stage.patterns.ramp import RampCode
 
 MEAN_TOLERANCE = 0.04
 """Distance of the mean of a wave from half of white above which the projector is not linear; photographs have 0.01."""
-EXPONENTS = 0.3, 4.0
-"""Least and greatest exponent of light = level^γ that is found."""
+EXPONENTS = 0.2, 5.0
+"""Least and greatest exponent of light = level^γ that is found: a response of 2.2 that is declared inversely is off by 2.2²."""
 IN_A_BIN = 30
 """Pixels that tell the sum of ramps in a part of the way between the borders."""
 TURN_BINS, LEAST_TURN_BINS = 36, 24
@@ -47,23 +47,24 @@ STEPS = 1024
 """Number of places at which a declared response is looked up."""
 
 
-def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> PatternProjector:
+def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, *,
+                  steady: bool) -> PatternProjector:
     """Return the projector with the exponent γ of light = level^γ that the waves of a capture show, and with the light that changed; itself
-    where they are as they should be."""
+    where they are as they should be. `steady`: False where the light is known to have changed: a declared response is not doubted then."""
     for code in collected.codes:
         if isinstance(code, PhaseCode):
-            found = _exponent_of_mean(sample, code, collected, projector, noise)
-            if found is None:
+            found = _exponent_of_mean(sample, code, collected, projector, noise, steady or projector.response is None)
+            if found is None and projector.response is None:  # blur makes a second harmonic smaller, and none of what is none
                 found = projector._replace(exponent=_exponent_of_harmonic(sample, code, noise))
-            if found != projector:
+            if found not in (None, projector):
                 return found
     return projector
 
 
-def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector,
-                      noise: NoiseModel) -> PatternProjector | None:
+def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
+                      bent: bool) -> PatternProjector | None:
     """Return the projector with the exponent from the mean of the waves between black and white, or with the light that changed where they
-    are not bent so; None without frames that tell them."""
+    are not bent so; None without frames that tell them. `bent`: whether it may be bent."""
     grey = sample.grey
     if collected.white is not None and collected.black is not None:
         dark, span = grey[collected.black], grey[collected.white] - grey[collected.black]
@@ -82,17 +83,19 @@ def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, pro
         return None
     grey, dark, span = grey[:, good], dark[good], span[good]
     mean = float(np.median([np.median((np.mean(grey[list(wave.frames)], axis=0) - dark) / span) for wave in even]))
-    if abs(mean - 0.5) <= MEAN_TOLERANCE:
+    off = abs(mean - float(bent_wave(projector.response).mean()))
+    if off <= MEAN_TOLERANCE:
         return projector
-    fine = np.linspace(*EXPONENTS, 371)
-    table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
+    fine = np.linspace(*EXPONENTS, 481)
+    table = [float(bent_wave(projector.shown_light(g)).mean()) for g in fine]
     exponent = float(np.interp(-mean, -np.array(table), fine))
-    harmonics = np.abs(np.fft.rfft(bent_wave(np.linspace(0, 1, 256)**exponent), norm="forward")[:3])
+    declared, found = (np.fft.rfft(bent_wave(projector.shown_light(g)), norm="forward").real[:3] for g in (1.0, exponent))
     seen, swing = np.median([_second_harmonic(wave, grey, span) for wave in even], axis=0)
-    sharp = min(swing / (2 * harmonics[1]), 1.0)
-    expected = np.sign(exponent - 1) * harmonics[2] / harmonics[1] * sharp**3  # blur dims the second as the fourth power of the first
-    if abs(expected) > LEAST_HARMONIC and seen / expected < BENT_PART:
-        return projector._replace(changed=abs(mean - 0.5))
+    sharp = min(swing / (2 * found[1]), 1.0) ** 3  # blur dims the second harmonic as the fourth power of the first
+    own = declared[2] / declared[1] * sharp
+    expected = found[2] / found[1] * sharp - own
+    if not bent or (abs(expected) > LEAST_HARMONIC and (seen - own) / expected < BENT_PART):
+        return projector._replace(changed=off)
     return projector._replace(exponent=exponent)
 
 
@@ -137,8 +140,11 @@ def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
                 "hold it")
     done = ("the error that this makes is" if found.left_rad is None else
             f"they were bent back by it, and the {found.left_rad:.2g} rad that this leaves are")
-    return (f"projector.response: is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear: {done} "
-            f"in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")
+    like = (f"is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear" if found.response is None else
+            f"the projected waves look like its light to the power of {found.exponent:.2g}, as where it is another, images are not in "
+            "color_space, or blur straightens waves")
+    return (f"projector.response: {like}: {done} in the standard deviation of {' and '.join(codes)}; measure the response with relit "
+            "calibrate response")
 
 
 def check_ramps(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
