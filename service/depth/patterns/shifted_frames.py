@@ -2,19 +2,21 @@
 
 The edges of stripes divide a surface as evenly as the projector's columns do, whichever frame shows them: an edge lies between those beside
 it. Where the edges of a frame lie aside of that, over the whole image, the image has shifted, and a place that one frame numbers is another
-one in the next. Frames whose stripes are a few pixels wide tell their shifts to a few hundredths of a pixel.
+one in the next. Frames whose stripes are a few pixels wide tell their shifts to a few hundredths of a pixel. Bits with their inverses add
+up to the same picture of the scene, whose texture and outlines tell by how much it has shifted, however fine the stripes are.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, median_filter, uniform_filter
+from scipy.ndimage import binary_dilation, median_filter, uniform_filter, uniform_filter1d
 
 from kernels.structured.edges import WHOLE, edge_error_of
 from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
 from service.depth.patterns.levels import contrasts
+from service.depth.patterns.pattern_checks import FULL_PART
 from service.depth.patterns.readings import line_readings
 from stage.capture.manifest import Frame
 from stage.patterns.binary import BinaryCode
@@ -49,6 +51,11 @@ ROUNDS = 20
 CLEAR_SIGMAS, OTHERS_SIGMAS, CLEAR_PX = 5.0, 3.0, 0.05
 """By how much the frames must differ in standard deviations, all of them and whichever of them is left out, and in camera pixels then: the
 finest alone is shifted by light below surfaces, the coarsest by what moves near its edge."""
+BLOCKS, SMOOTHED = 16, 5
+"""Groups of lines whose shifts are compared, so that a thing that moves is in fewer than half of them, and length in pixels of the mean
+along lines, over which a picture is as good as linear."""
+PICTURES_PX = 0.25
+"""Least shift of these pictures in camera pixels: encoded images, and dark readings that are cut off at zero, look like .12 of a pixel."""
 OVER = 15
 """Side in pixels of the square over which the step of places from pixel to pixel is averaged."""
 
@@ -60,6 +67,8 @@ class FrameShifts(NamedTuple):
     deviation: np.ndarray  # [compared frames] camera pixels
     beside_steps: np.ndarray  # [compared frames] the same where edges may lie beside steps of the surface
     time: np.ndarray  # [compared frames] places in the sequence
+    pictures: bool = False
+    """Whether pictures of the scene tell them: no light below surfaces shifts one of these."""
 
     @property
     def clear(self) -> bool:
@@ -72,6 +81,8 @@ class FrameShifts(NamedTuple):
         return self.clear and self._differ(self.beside_steps)
 
     def _differ(self, deviation: np.ndarray) -> bool:
+        if self.pictures:
+            return bool(np.ptp(self.shift) > PICTURES_PX and self._away(deviation, slice(None)) > CLEAR_SIGMAS)
         others = ~np.eye(len(self.shift), dtype=bool)
         return self._away(deviation, slice(None)) > CLEAR_SIGMAS and all(
             np.ptp(self.shift[kept]) > CLEAR_PX and self._away(deviation, kept) > OTHERS_SIGMAS for kept in others)
@@ -94,12 +105,13 @@ def widen_shifted(planes: Planes, coordinates: Coordinates, decoders: Sequence[A
     """Add to the deviations of places what shifts of the images make; return what is said of it, and the factor of `Coordinates.widen`."""
     def off(axis: AxisMaps, decoder: AxisDecoder) -> np.ndarray | None:
         across = _across(axis)
-        found = find_shifts(planes, axis, decoder, collected, frames, across)
-        if found is None or not found.clear:
+        edges = find_shifts(planes, axis, decoder, collected, frames, across)
+        pictures = _shifts_of_pictures(planes, axis, collected, across)
+        told = [each for each in (edges, pictures) if each is not None and each.clear]
+        if not told:
             return None
-        if found.sure:
-            coordinates.shift_px = max(coordinates.shift_px, float(np.ptp(found.shift)))
-        return found.over(len(frames)) * _slope(axis, across)
+        coordinates.shift_px = max(coordinates.shift_px, *(float(np.ptp(each.shift)) for each in told if each.sure), 0.0)
+        return max(each.over(len(frames)) for each in told) * _slope(axis, across)
 
     wider = coordinates.widen(decoders, off)
     if not coordinates.shift_px:
@@ -141,6 +153,38 @@ def find_shifts(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected:
         edges.append(_edges(level[index], near, seen, stripes, code.stripe_px, usual, index))
     time = np.array(code.frames) if inverses is None else (np.array(code.frames) + np.array(inverses)) / 2
     return _solve(np.concatenate(edges), usual, time)
+
+
+def _shifts_of_pictures(planes: Planes, axis: AxisMaps, collected: Collected, across: int) -> FrameShifts | None:
+    """Return the shifts along lines of what bits and their inverses show together, from its slopes by least squares (Lucas and Kanade,
+    1981) beside its brightness, stripes that a lamp leaves which flickers, and their squares, which a camera leaves that is not linear; the
+    median over groups of lines. None with too few pixels."""
+    pairs = [pair for code in collected.codes if isinstance(code, BinaryCode) and code.inverses is not None
+             for pair in zip(code.frames, code.inverses, strict=True)]
+    if len(pairs) < 2:
+        return None
+    grey, clipped = line_readings(planes, _even_lines(axis, across), across)
+    full = grey.max(axis=0) >= FULL_PART * grey.max()
+    known = ~binary_dilation(full if clipped is None else full | clipped, np.ones((1, SMOOTHED + 2), bool))
+    sums, stripes = (uniform_filter1d(np.array([grey[bit] + sign * grey[inverse] for bit, inverse in pairs]), SMOOTHED, axis=2)
+                     for sign in (1, -1))
+    mean = sums.mean(axis=0)
+    slope, square = np.gradient(mean, axis=1), stripes**2 / np.maximum(mean, 1e-9)
+    square -= square.mean(axis=0)
+    shift = []
+    for block in np.array_split(np.arange(len(known)), BLOCKS):
+        seen = known[block]
+        if seen.sum() >= ENOUGH:
+            terms = [np.stack([-slope[block][seen], mean[block][seen], *each], axis=1)
+                     for each in zip(stripes[:, block][:, seen], square[:, block][:, seen], strict=True)]
+            shift.append([np.linalg.lstsq(term, light - mean[block][seen], rcond=None)[0][0]
+                          for term, light in zip(terms, sums[:, block][:, seen], strict=True)])
+    if 2 * len(shift) < BLOCKS:
+        return None
+    middle = np.median(shift, axis=0)
+    spread = 1.25 * MAD_TO_SIGMA * float(np.median(np.abs(shift - middle))) / len(shift) ** 0.5  # of a median
+    deviation = np.full(len(pairs), max(spread, 1e-6))
+    return FrameShifts(middle - middle.mean(), deviation, deviation, np.mean(pairs, axis=1), pictures=True)
 
 
 def _even_lines(axis: AxisMaps, across: int) -> np.ndarray:

@@ -70,3 +70,11 @@ def test_a_camera_that_shakes_is_named_and_sigma_holds_it(tmp_path, light, name)
     said, size, off = measured(tmp_path, light, name, lambda part: rng.normal(0, 0.5))
     assert len(said) == 1 and size > 0.3
     assert (off > 5).mean() < 0.005  # .04 and .07 %, without it .2 and 2 %
+
+
+@first_short("part", [0.8, 0.7])
+def test_a_jump_before_the_finest_bits_is_named_and_sigma_holds_it(tmp_path, light, part):
+    """Their stripes are too fine to show edges; what they and their inverses show together is the same scene, aside."""
+    said, size, off = measured(tmp_path, light, "Gray with inverses", lambda now: float(now > part))
+    assert len(said) == 1 and size == pytest.approx(1.0, abs=0.15)
+    assert (off > 5).mean() < 0.005
