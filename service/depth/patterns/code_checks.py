@@ -148,19 +148,21 @@ def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
     beyond = (np.minimum(*(declared.ravel()[side] for side in (pairs.first, pairs.second))) * stripe_px >= extent) & ~jumps
     outside = beyond.sum() > max(BEYOND_SHARE * len(steps), AT_A_PLACE)
     if steps.any():
-        orders = [("binary" if code.name == "gray" else "gray", None)] if code.name != "xor" else []
-        swaps = list(combinations(range(len(stripes.bits)), 2)) if code.name == "binary" else []
-        mended: list[tuple[float, str]] = []
-        for other, swap in [*orders, *((code.name, swap) for swap in swaps)]:
-            bits = stripes.bits if swap is None else _with_exchanged(stripes.bits, swap)
-            part = mends(_numbers(bits, gray=other != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside))
-            words = (f"a {code.name} code is declared, and they follow each other as those of a {other} code: check code in the frames' "
-                     "patterns" if swap is None
-                     else f"they follow each other if {_exchange_words(swap, stripes)}")
-            if part is not None:
-                mended.append((part, words))
+        other = "binary" if code.name == "gray" else "gray"
+        others = [(stripes.bits, other, f"a {code.name} code is declared, and they follow each other as those of a {other} code: check "
+                   "code in the frames' patterns")] if code.name != "xor" else []
+        if code.name == "binary":
+            count = range(len(stripes.bits))
+            others += [(_with_exchanged(stripes.bits, swap), code.name, f"they follow each other if {_exchange_words(swap, stripes)}")
+                       for swap in combinations(count, 2)]
+            others += [(stripes.bits ^ np.equal(count, bit)[:, None, None], code.name,
+                        f"they follow each other if dark and bright of the bit {bit + stripes.finest} are exchanged: check inverse and the "
+                        "order of its images in the frames' patterns") for bit in count]
+        parts = [(mends(_numbers(bits, gray=name != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside)), words)
+                 for bits, name, words in others]
+        mended = [(part, words) for part, words in parts if part is not None]
         if mended:
-            return f"the {code.axis} stripes jump between {jumps.sum()} neighbours; {min(mended)[1]}"
+            return f"the {code.axis} stripes do not follow each other as declared; {min(mended)[1]}"
     if outside:
         widest = np.percentile(np.maximum(declared.ravel()[pairs.first], declared.ravel()[pairs.second])[~jumps], 99.9)
         return (f"{100 * beyond.mean():.2g} % of the {code.axis} stripes that are seen lie beyond the {extent} px of projector.resolution: "

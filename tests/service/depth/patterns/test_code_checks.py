@@ -71,7 +71,8 @@ def test_right_declarations_raise_no_doubt(scene, patterns):
     (WAVES, changed(WAVES, "phase", step=lambda p: (p["step"] + 1) % 4), "are offset by"),
     (BINARY, changed(BINARY, "binary", bit=lambda p: {4: 5, 5: 4}.get(p["bit"], p["bit"])), "the bits 4 and 5 are exchanged"),
     (WAVES, changed(WAVES, "phase", period_px=lambda p: 15.0), "look like waves of 1"),
-], ids=["gray as binary", "binary as gray", "reversed", "three reversed", "sine", "coarse bits", "period"])
+    (BINARY, changed(BINARY, "binary", inverse=lambda p: p["inverse"] != (p["bit"] == 3)), "dark and bright of the bit 3 are exchanged"),
+], ids=["gray as binary", "binary as gray", "reversed", "three reversed", "sine", "coarse bits", "period", "one bit and its inverse"])
 def test_a_wrong_declaration_is_named(scene, patterns, declared, words):
     assert words in said(scene, patterns, declared)
 
