@@ -217,9 +217,9 @@ def card_kept(camera: TwinCamera | None) -> Iterator[None]:
     stop = threading.Event()
     with ThreadPoolExecutor(1, thread_name_prefix="relit-card") as pool:
         keeping = pool.submit(camera.keep_card, stop)
-        while camera.on_card < 0 and not keeping.done():
-            time.sleep(CARD_POLL_S / 100)
         try:
+            while camera.on_card < 0 and not keeping.done():
+                time.sleep(CARD_POLL_S / 100)
             yield
         finally:
             stop.set()
