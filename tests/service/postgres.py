@@ -34,11 +34,11 @@ class Postgres:
         self._databases = 0
         self._user = None if os.geteuid() != 0 else next(user.pw_name for user in pwd.getpwall() if user.pw_name in ORDINARY_USERS)
 
-    def new_database(self) -> str:
-        """The URL of a database that is empty."""
+    def new_database(self, template: str = "template1") -> str:
+        """The URL of a database that is empty, or a copy of one that nobody is connected to."""
         self._databases += 1
         name = f"{NAME}{self._databases}"
-        self._do("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", NAME, name)
+        self._do("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", NAME, "-T", template, name)
         return f"postgresql://{NAME}@127.0.0.1:{self._port}/{name}"
 
     def create(self) -> None:

@@ -1,4 +1,4 @@
-"""A database of SQLite with all tables, made once a run and copied: making them takes some tenths of a second."""
+"""Databases with all tables, which are made once a run and copied: making them takes some tenths of a second."""
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -8,7 +8,9 @@ from tempfile import TemporaryDirectory
 
 from service.server.base.settings import Settings
 from service.server.database.engine import Database, connect
+from service.server.database.schema import is_current
 from service.server.jobs import queue
+from tests.service.postgres import Postgres
 
 
 def prepare(settings: Settings, database: Database) -> None:
@@ -16,8 +18,10 @@ def prepare(settings: Settings, database: Database) -> None:
     if settings.is_sqlite and not settings.sqlite_file.exists():
         settings.data.mkdir(parents=True, exist_ok=True)
         settings.sqlite_file.write_bytes(_with_tables())
-    else:
+    elif settings.is_sqlite or not is_current(database):
         queue.prepare(settings, database)
+    else:
+        settings.data.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
@@ -26,6 +30,21 @@ def opened(settings: Settings) -> Iterator[Database]:
     with closing(connect(settings.sqlalchemy_url)) as database:
         prepare(settings, database)
         yield database
+
+
+def new_on(server: Postgres) -> str:
+    """The URL of a new database of PostgreSQL with all tables."""
+    return server.new_database(_template(server))
+
+
+@cache
+def _template(server: Postgres) -> str:
+    url = server.new_database()
+    with TemporaryDirectory() as folder:
+        settings = Settings(data=Path(folder), database_url=url)
+        with closing(connect(settings.sqlalchemy_url)) as database:
+            queue.prepare(settings, database)
+    return url.rpartition("/")[2]
 
 
 @cache

@@ -22,9 +22,11 @@ CAPTURE, RECEIVING, UPLOAD = "cap_0123456789abcdefghjk", "cap_1123456789abcdefgh
 DONE, WAITING, KEY = "job_0123456789abcdefghjk", "job_1123456789abcdefghjk", "key_0123456789abcdefghjk"
 
 
-@pytest.fixture
-def settings(tmp_path, database_url) -> Settings:
-    made = Settings(data=tmp_path / "data", database_url=database_url)
+@pytest.fixture(params=["sqlite", "postgresql"])
+def settings(request, tmp_path) -> Settings:
+    """Settings of a service whose database is empty."""
+    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+    made = Settings(data=tmp_path / "data", database_url=url)
     made.data.mkdir()
     return made
 

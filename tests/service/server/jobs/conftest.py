@@ -7,6 +7,7 @@ import pytest
 
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import Undisturbed, harness, relit_relight
+from tests.service.server.prepared import new_on
 
 FRAMES = 36
 SIZE = 256
@@ -15,7 +16,7 @@ SIZE = 256
 
 @pytest.fixture
 def on_postgres(server_postgres) -> str:
-    return server_postgres.new_database()
+    return new_on(server_postgres)
 
 
 @pytest.fixture
