@@ -77,9 +77,9 @@ def pytest_collection() -> Generator[None, object, object]:
         atexit.register(gc.unfreeze)  # some libraries look for leaks as the interpreter ends; pytest's last search comes before
 
 
-ONE_SERVER = ("tests/service/server/api", "tests/service/server/pages", "tests/service/client")
-"""Folders whose tests share a server, which takes processor time as long as it runs: one process of the run has all of them, and ends the
-server after them."""
+ONE_SERVER = {"tests/service/server/api": "api", "tests/service/client": "api", "tests/service/server/pages": "pages"}
+"""Folders whose tests share a server, by a name for it: it takes processor time as long as it runs, so that one process of the run has all
+of them, and ends the server after them."""
 OWN_SERVER = ("test_operation_faults.py", "test_projector_page.py", "test_published_page.py", "test_reliability.py", "test_set_page.py",
               "test_tokens.py", "test_traces.py")
 """Files of these folders that start servers of their own, or need none: any process of the run may have them."""
@@ -88,8 +88,8 @@ PROGRAMS = ("clients", "server")
 
 
 def together(file: str) -> str:
-    """Return what one process of the run has all of: the folder of a test file, or the file."""
-    return next((folder for folder in ONE_SERVER if file.startswith(f"{folder}/") and not file.endswith(OWN_SERVER)), file)
+    """Return what one process of the run has all of: the name of a server whose tests a file has, or the file."""
+    return next((name for folder, name in ONE_SERVER.items() if file.startswith(f"{folder}/") and not file.endswith(OWN_SERVER)), file)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -106,9 +106,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> object:
-    """End the server of a folder with the last test of the folder, as if that ended the run: idle it would take a tenth of the time."""
+    """End a server with the last test that shares it, as if that ended the run: idle it would take a tenth of the time."""
     group = together(item.nodeid.partition("::")[0])
-    if nextitem is None or group not in ONE_SERVER or group == together(nextitem.nodeid.partition("::")[0]):
+    if nextitem is None or group not in ONE_SERVER.values() or group == together(nextitem.nodeid.partition("::")[0]):
         return None
     return item.ihook.pytest_runtest_protocol(item=item, nextitem=None)
 
@@ -126,7 +126,7 @@ def left_out(items: list[pytest.Item], part: int) -> list[pytest.Item]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the folders of which one process has all, and spread the files that start other programs evenly over the run.
+    """Begin with the folders whose tests share a server, and spread the files that start other programs evenly over the run.
 
     Side by side these would wait for each other's processor time. Files with more long tests come first, so that at the end no process of
     the run is left with one of them.
@@ -143,8 +143,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         groups.setdefault(together(item.nodeid.partition("::")[0]), []).append(item)
     in_order = sorted(groups, key=lambda group: -sum(map(is_long, groups[group])))
-    folders = [group for group in ONE_SERVER if group in groups]
-    starts = [group for group in in_order if group not in folders and set(PROGRAMS) & set(Path(group).parts)]
-    others = [group for group in in_order if group not in folders and group not in starts]
+    servers = [group for group in dict.fromkeys(ONE_SERVER.values()) if group in groups]
+    starts = [group for group in in_order if group not in servers and set(PROGRAMS) & set(Path(group).parts)]
+    others = [group for group in in_order if group not in servers and group not in starts]
     place = {group: (number + 0.5) / len(some) for some in (starts, others) for number, group in enumerate(some)}
-    items[:] = [item for group in folders + sorted(place, key=lambda group: place[group]) for item in groups[group]]
+    items[:] = [item for group in servers + sorted(place, key=lambda group: place[group]) for item in groups[group]]

@@ -1,6 +1,7 @@
 """The program, run inside the test's process."""
 
 import json
+import os
 import sys
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,8 @@ from stage.results.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball
 from tests.service.postgres import binaries, postgres
 from tests.service.recording import Recording
+
+SAMPLES = Path(__file__).resolve().parents[2] / "samples"
 
 
 class Outcome(NamedTuple):
@@ -118,6 +121,17 @@ def server_postgres():
         pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
     with postgres(programs) as server:
         yield server
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory):
+    """A server without keys and with a worker, which the tests of the API and those of the client share."""
+    from tests.service.server_process import serving
+
+    folder = tmp_path_factory.mktemp("server")
+    with serving(folder, "--anonymous", "--device", "cpu", sabotage="long", hook_networks="127.0.0.0/8",
+                 roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")])) as running:
+        yield running
 
 
 @pytest.fixture

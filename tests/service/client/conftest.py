@@ -1,17 +1,17 @@
-"""One server with a worker for the tests of the client, reached with a key, and ways to break what lies between."""
+"""The server of the tests of the API, reached with a key by the tests of the client, and ways to break what lies between."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NoReturn
 
 import httpx2
 import pytest
 
 from service.client import Client
-from tests.service.server_process import Server, serving
+from tests.service.conftest import SAMPLES
+from tests.service.server_process import Server
 
-HOME = Path(__file__).resolve().parents[3]
-OWL = HOME / "samples" / "owl"
+HOME = SAMPLES.parent
+OWL = SAMPLES / "owl"
 SKY = OWL / "environment.exr"
 
 
@@ -56,12 +56,6 @@ def lose(answer: httpx2.Response) -> NoReturn:
     answer.read()
     answer.close()
     raise httpx2.ReadError("the test lost the answer")
-
-
-@pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("server"), "--device", "cpu", sabotage="long", roots=str(OWL.parent)) as running:
-        yield running
 
 
 @pytest.fixture(scope="session")

@@ -1,27 +1,17 @@
-"""One server for the tests of the API, without keys and with one worker; each test makes its own captures and jobs."""
+"""What the tests of the API have on their server, which has no keys and one worker; each test makes its own captures and jobs."""
 
-import os
 import re
 from pathlib import Path
 
 import pytest
 
+from tests.service.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted, finish, submit
 from tests.service.server.api.tus import Tus
 from tests.service.server_process import Server, serving
 
-HOME = Path(__file__).resolve().parents[4]
-SAMPLES = HOME / "samples"
 PEAK_BYTES = 1 << 30
 """Of a worker: its libraries take a fifth, and a manifest of MAX_MANIFEST_BYTES up to 40 times its size."""
-
-
-@pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("server")
-    with serving(folder, "--anonymous", "--device", "cpu", sabotage="long", hook_networks="127.0.0.0/8",
-                 roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")])) as running:
-        yield running
 
 
 @pytest.fixture(scope="session")
