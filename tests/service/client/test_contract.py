@@ -24,6 +24,7 @@ from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
 from tests.scenes.captures import write_capture
 from tests.service.client.conftest import HOME, OWL, SKY, Between, lose
+from tests.service.server.api.asgi import openapi
 
 OF_HTTP = {"host", "accept", "accept-encoding", "connection", "user-agent", "authorization", "content-length", "content-type",
            "transfer-encoding", "cache-control"}
@@ -39,9 +40,8 @@ USED = {
 
 
 @pytest.fixture(scope="module")
-def document(server) -> dict[str, Any]:
-    with server.client() as client:
-        return client.get("/v1/openapi.json").raise_for_status().json()
+def document() -> dict[str, Any]:
+    return openapi()
 
 
 def resolved(document: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:

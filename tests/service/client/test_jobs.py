@@ -1,6 +1,7 @@
 """Jobs waited for over a network that breaks, and what they made, fetched."""
 
 import json
+import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,21 +9,24 @@ import httpx2
 import pytest
 
 from service.client import Client, Conflict, FileError, JobEnded, NotFound, Unreachable
-from service.requests.jobs import ExportJob, PipelineJob, RelightJob, SolveJob
+from service.requests.base.identifiers import CAPTURE, new_id
+from service.requests.jobs import RelightJob, SolveJob
 from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
 from tests.service.client.conftest import Between, Cut, lose
 from tests.service.recording import Recording
+from tests.service.server.api.job_calls import succeeded
 
 Send = Callable[[], httpx2.Response]
 
 
 @pytest.fixture(scope="session")
-def solved(server, key, dome, sky) -> str:
-    with Client(server.url, key) as client:
-        job = client.jobs.submit(PipelineJob(kind="pipeline", capture=dome, environment=sky, solve=SolveOptions(method=Method.LAMBERT),
-                                             relight=RelightOptions(frames="1-3", spin_degrees=360)))
-        return client.jobs.wait(job.id).id
+def results(server) -> Path:
+    """The folder of the results of a job, which has its name: one of several megabytes, and small ones."""
+    folder = succeeded(server, SolveJob(kind="solve", capture=new_id(CAPTURE)), "owls")
+    for name, size in {"asset.usdz": 5 << 19, "frame.0001.exr": 1000, "frame.0002.exr": 1, "report.json": 0}.items():
+        (folder / name).write_bytes(random.Random(name).randbytes(size))
+    return folder
 
 
 def frames(capture: str, environment: str, count: int, **common: object) -> RelightJob:
@@ -133,28 +137,26 @@ def test_waiting_ends_with_patience(server, key, dome: str, sky: str):
             client.jobs.wait(job.id)
 
 
-@pytest.mark.long
-def test_results_are_fetched(client: Client, server, solved: str, tmp_path: Path):
-    there = server.data / "projects" / "owls" / "jobs" / solved
+def test_results_are_fetched(client: Client, results: Path, tmp_path: Path):
     told = Recording()
-    found = client.jobs.download(solved, tmp_path / "out", progress=told)
-    assert [path.name for path in found] == ["asset.usdz", "frame.0001.exr", "frame.0002.exr", "frame.0003.exr", "maps.exr", "report.json"]
+    found = client.jobs.download(results.name, tmp_path / "out", progress=told)
+    assert [path.name for path in found] == ["asset.usdz", "frame.0001.exr", "frame.0002.exr", "report.json"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [path.name for path in found]
     for path in found:
-        assert path.read_bytes() == (there / path.name).read_bytes()
+        assert path.read_bytes() == (results / path.name).read_bytes()
     assert [stage[:2] for stage in told.stages] == [("download", -(-sum(path.stat().st_size for path in found) // 2**20))]
-    assert [file.size for file in client.jobs.results(solved)] == [path.stat().st_size for path in found]
-    assert client.jobs.download(solved, tmp_path / "one", names=["report.json"]) == [tmp_path / "one" / "report.json"]
+    assert [file.size for file in client.jobs.results(results.name)] == [path.stat().st_size for path in found]
+    assert client.jobs.download(results.name, tmp_path / "one", names=["report.json"]) == [tmp_path / "one" / "report.json"]
     with pytest.raises(FileError, match=r"has no result picture\.exr"):
-        client.jobs.download(solved, tmp_path / "one", names=["picture.exr"])
+        client.jobs.download(results.name, tmp_path / "one", names=["picture.exr"])
     with pytest.raises(FileError, match=r"cannot make .*report\.json"):
-        client.jobs.download(solved, tmp_path / "one" / "report.json")
+        client.jobs.download(results.name, tmp_path / "one" / "report.json")
 
 
 @pytest.mark.parametrize("runs", [1, 2])
-def test_a_broken_download_is_gone_on_with(server, key, solved: str, tmp_path: Path, runs: int):
+def test_a_broken_download_is_gone_on_with(server, key, results: Path, tmp_path: Path, runs: int):
     """In the same run, or in the next one, after the first was ended with a part of the file."""
-    whole = (server.data / "projects" / "owls" / "jobs" / solved / "asset.usdz").read_bytes()
+    whole = (results / "asset.usdz").read_bytes()
     asked = []
 
     def breaks(request: httpx2.Request, send: Send) -> httpx2.Response:
@@ -171,20 +173,17 @@ def test_a_broken_download_is_gone_on_with(server, key, solved: str, tmp_path: P
         with Client(server.url, key, transport=between) as client:
             if run + 1 < runs:
                 with pytest.raises(KeyboardInterrupt):
-                    client.jobs.download(solved, tmp_path, names=["asset.usdz"])
+                    client.jobs.download(results.name, tmp_path, names=["asset.usdz"])
                 part, = tmp_path.iterdir()
                 assert part.name.startswith(".asset.usdz.")
             else:
-                found, = client.jobs.download(solved, tmp_path, names=["asset.usdz"])
+                found, = client.jobs.download(results.name, tmp_path, names=["asset.usdz"])
     assert found.read_bytes() == whole
     assert [path.name for path in tmp_path.iterdir()] == ["asset.usdz"]
     assert asked == [None, f"bytes={len(whole) // 2}-"]
 
 
-@pytest.mark.long
-def test_a_file_that_changed_meanwhile_is_fetched_from_its_beginning(client: Client, between: Between, dome: str, tmp_path: Path):
-    job = client.jobs.wait(client.jobs.submit(SolveJob(kind="solve", capture=dome, options=SolveOptions(method=Method.LAMBERT))).id)
-    asset = client.jobs.wait(client.jobs.submit(ExportJob(kind="export", maps=job.id)).id)
+def test_a_file_that_changed_meanwhile_is_fetched_from_its_beginning(client: Client, between: Between, results: Path, tmp_path: Path):
     first, other = b"a" * 100_000, b"b" * 90_000
     etags = iter(['"1"', '"2"'])
 
@@ -198,14 +197,14 @@ def test_a_file_that_changed_meanwhile_is_fetched_from_its_beginning(client: Cli
                                stream=Cut(stream, 40_000, httpx2.ReadError) if etag == '"1"' else stream)
 
     between.breaks = breaks
-    found, = client.jobs.download(asset.id, tmp_path, names=["asset.usdz"])
+    found, = client.jobs.download(results.name, tmp_path, names=["asset.usdz"])
     assert found.read_bytes() == other
     assert [path.name for path in tmp_path.iterdir()] == ["asset.usdz"]
 
 
 @pytest.mark.parametrize("name", ["../out.exr", "/etc/out.exr", "a/../../out.exr", "a\\b.exr", "c:out.exr"])
-def test_a_name_that_leads_elsewhere_is_refused(client: Client, between: Between, solved: str, tmp_path: Path, name: str):
+def test_a_name_that_leads_elsewhere_is_refused(client: Client, between: Between, results: Path, tmp_path: Path, name: str):
     body = {"results": [{"name": name, "size": 1, "modified_at": "2026-01-01T00:00:00Z", "url": ""}], "next": None}
     between.breaks = lambda request, send: httpx2.Response(200, content=json.dumps(body), request=request)
     with pytest.raises(FileError, match="names a file that cannot be written here"):
-        client.jobs.download(solved, tmp_path / "in")
+        client.jobs.download(results.name, tmp_path / "in")

@@ -3,7 +3,9 @@
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
@@ -57,6 +59,13 @@ def app_of(settings: Settings) -> Iterator[FastAPI]:
     """The app over a database of its own, in this process and without workers."""
     with opened(settings) as database:
         yield create_app(settings, database)
+
+
+@cache
+def openapi() -> dict[str, Any]:
+    """The OpenAPI document, which takes long to make."""
+    with TemporaryDirectory() as folder, app_of(Settings(data=Path(folder))) as app:
+        return app.openapi()
 
 
 def asynchronous(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:

@@ -5,14 +5,16 @@ from pathlib import Path
 
 import httpx2
 
-from service.requests.base.identifiers import new_id
+from service.requests.base.base import JobRequest
+from service.requests.base.identifiers import JOB, new_id
 from service.server.database import intakes, jobs
 from service.server.database.engine import Database
+from service.server.storage import layout
 from tests.service.server_process import Server
 from tests.service.waiting import until
 
 ENDED = ("succeeded", "failed", "cancelled")
-NOBODY = new_id("job")
+NOBODY = new_id(JOB)
 
 
 def submit(client: httpx2.Client, **request) -> dict:
@@ -32,6 +34,16 @@ def finish(server: Server, client: httpx2.Client, job: dict, state: str = "succe
 def finished(server: Server, client: httpx2.Client, **request) -> dict:
     """A job that succeeds."""
     return finish(server, client, submit(client, **request))
+
+
+def succeeded(server: Server, request: JobRequest, project: str = "default") -> Path:
+    """Record a job that nobody has done as one that has succeeded, and return the empty folder of its results, which has its name."""
+    job = new_id(JOB)
+    with server.database() as database:
+        database.transact(lambda connection: jobs.insert(connection, project=project, request=request, finished=job))
+    folder = server.data / layout.results(project, job)
+    folder.mkdir(parents=True)
+    return folder
 
 
 def error_of(server: Server, client: httpx2.Client, **request) -> str:

@@ -13,6 +13,7 @@ from service.requests.base.identifiers import ANNOTATION, CAPTURE, ENVIRONMENT, 
 from service.requests.keys import Scope
 from service.server.database import tables, workers
 from service.server.database.engine import Database
+from tests.service.server.api.asgi import openapi
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted, refused
 from tests.service.server_process import Server, new_key, revoke
@@ -58,11 +59,9 @@ def site(keyed, keyed_database):
     return made
 
 
-def operations(site: Site) -> list[tuple[str, str]]:
+def operations() -> list[tuple[str, str]]:
     """Method and path of everything that the OpenAPI document names."""
-    with site.server.client() as client:
-        document = client.get("/v1/openapi.json").raise_for_status().json()
-    found = [(method, path) for path, item in document["paths"].items() for method in item if method not in ("parameters", "options")]
+    found = [(method, path) for path, item in openapi()["paths"].items() for method in item if method not in ("parameters", "options")]
     assert len(found) > 25
     return found
 
@@ -89,7 +88,7 @@ def of_admins(path: str) -> bool:
 @pytest.mark.long
 def test_every_route_but_those_of_health_asks_for_a_key(site):
     with site.server.client() as client:
-        for method, path in operations(site):
+        for method, path in operations():
             response = ask(client, method, path, site.ours)
             if (method, path) in OPEN:
                 assert response.status_code in (200, 503)
@@ -163,7 +162,7 @@ def test_only_a_hash_of_a_key_is_kept_and_the_numbers_name_no_project(site):
 
 def test_a_key_that_reads_changes_nothing(site):
     with site.client("larch", Scope.READ) as client:
-        for method, path in operations(site):
+        for method, path in operations():
             response = ask(client, method, path, site.ours)
             if method in CHANGES or of_admins(path):
                 refused(response, 403, "has the scope read, this needs")
@@ -174,7 +173,7 @@ def test_a_key_that_reads_changes_nothing(site):
 
 def test_a_key_that_writes_registers_no_folders_and_reads_no_numbers(site):
     with site.client("larch", Scope.WRITE) as client:
-        for method, path in operations(site):
+        for method, path in operations():
             if path.endswith("}") and method == "delete":
                 assert not of_admins(path) or ask(client, method, path, site.ours).status_code == 403
                 continue  # it may delete the others, which are still needed
@@ -193,7 +192,7 @@ def test_a_project_finds_nothing_of_another(site):
               "name": "maps.exr", "hook": new_id(HOOK), "annotation": new_id(ANNOTATION), "worker": "nothing-cpu-2"}
     walked = 0
     with site.client("willow") as client:
-        for method, path in operations(site):
+        for method, path in operations():
             if "{" not in path:
                 continue
             theirs, nothing = (ask(client, method, path, names) for names in (site.ours, absent))

@@ -3,6 +3,7 @@
 import asyncio
 import http.client
 import os
+import random
 import shutil
 import time
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.requests.base.identifiers import CAPTURE, new_id
+from service.requests.jobs import SolveJob
 from service.server.api.problems import ApiError
 from service.server.api.results import asked_range, tag_matches
 from service.server.base.settings import Settings
@@ -25,24 +28,28 @@ from stage.formats import exr
 from stage.results import small_picture
 from tests.service.server.api.asgi import Call, app_of
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import ENDED, NOBODY, finish, finished, made_by, refused, report_of, result, submit
+from tests.service.server.api.job_calls import ENDED, NOBODY, finished, made_by, refused, report_of, result, submit, succeeded
 from tests.service.server.api.test_watch import queue
 from tests.service.server_process import Server
 
+FRAMES = 40
 LARGE = 64 << 20
 """More than the sockets between server and client hold, so that a download of it is under way for as long as nobody reads."""
 
 
 @pytest.fixture(scope="module")
-def frames(client, dome, sky) -> str:
-    """A job that makes frames."""
-    return submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-40"})["id"]
+def folder(server) -> Path:
+    """The folder of the results of a job that has made frames."""
+    made = succeeded(server, SolveJob(kind="solve", capture=new_id(CAPTURE)))
+    for number in range(1, FRAMES + 1):
+        (made / f"frame.{number:04d}.exr").write_bytes(random.Random(number).randbytes(1000 + number))
+    return made
 
 
 @pytest.fixture(scope="module")
-def folder(server, client, frames) -> Path:
-    finish(server, client, {"id": frames})
-    return server.data / "projects/default/jobs" / frames
+def frames(folder) -> str:
+    """The job."""
+    return folder.name
 
 
 @pytest.fixture
@@ -83,7 +90,8 @@ def test_results_name_no_place_of_the_server(server, client, dome, sky):
 
 
 @pytest.mark.long
-def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):
+def test_what_is_listed_while_a_job_runs_is_complete(client, dome, sky):
+    frames = submit(client, kind="relight", capture=dome, environment=sky, options={"frames": f"1-{FRAMES}"})["id"]
     seen: dict[str, bytes] = {}
     while client.get(f"/v1/jobs/{frames}").json()["state"] not in ENDED:
         listed = client.get(f"/v1/jobs/{frames}/results").raise_for_status().json()["results"]
@@ -93,7 +101,7 @@ def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):
                 assert len(seen[file["name"]]) == file["size"]
         time.sleep(0.02)
     after = client.get(f"/v1/jobs/{frames}/results").json()["results"]
-    assert [file["name"] for file in after] == [f"frame.{number:04d}.exr" for number in range(1, 41)]
+    assert [file["name"] for file in after] == [f"frame.{number:04d}.exr" for number in range(1, FRAMES + 1)]
     for name, content in seen.items():
         assert client.get(f"/v1/jobs/{frames}/results/{name}").content == content
 
@@ -106,7 +114,7 @@ def test_the_listing_comes_a_page_at_a_time_of_a_job_that_is_there(client, frame
         page = client.get(f"/v1/jobs/{frames}/results", params={"limit": 15, **after}).raise_for_status().json()
         found += page["results"]
         after = None if page["next"] is None else {"after": page["next"]}
-    assert found == whole["results"] and len(found) == 40
+    assert found == whole["results"] and len(found) == FRAMES
     for path in ("", "/frame.0001.exr"):
         refused(client.get(f"/v1/jobs/{NOBODY}/results{path}"), 404, "")
     assert client.request("DELETE", f"/v1/jobs/{frames}/results/frame.0001.exr").headers["Allow"] == "GET, HEAD"

@@ -1,30 +1,18 @@
 """Registration, fusion and joining as jobs, of depths and maps that other jobs have made."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, JOB, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import DepthJob, SolveJob
-from service.server.database import jobs
-from service.server.storage import layout
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.scenes.register import seen
 from tests.scenes.turntable import figure
 from tests.service.joining.test_join import write
-from tests.service.server.api.job_calls import NOBODY, finished, made_by, refused, report_of, result
+from tests.service.server.api.job_calls import NOBODY, finished, made_by, refused, report_of, result, succeeded
 
 pytestmark = pytest.mark.long
-
-
-def made(server, model: type[DepthJob | SolveJob], kind: str) -> tuple[str, Path]:
-    """A job that has succeeded, and the folder of its results."""
-    job, request = new_id(JOB), model(kind=kind, capture=new_id(CAPTURE))
-    with server.database() as database:
-        database.transact(lambda connection: jobs.insert(connection, project="default", request=request, finished=job))
-    return job, server.data / layout.results("default", job)
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +25,12 @@ def depths(server, views) -> list[str]:
     """Jobs with the depths of three views, whose poses are known to some millimetres."""
     names, random = [], np.random.default_rng(3)
     for view in views:
-        name, results = made(server, DepthJob, "depth")
+        results = succeeded(server, DepthJob(kind="depth", capture=new_id(CAPTURE)))
         pose = view.world_from_scan.copy()
         pose[:3, 3] += random.normal(scale=0.002, size=3)
         camera = view.camera.model_copy(update={"world_from_camera": tuple(map(tuple, pose.tolist()))})
         DepthMaps(camera=camera, mask=view.mask, depth=view.depth, sigma=view.sigma).write(results / "depth.exr")
-        names.append(name)
+        names.append(results.name)
     return names
 
 
@@ -82,13 +70,10 @@ def test_what_cannot_be_registered_or_fused_is_refused(client, depths, registere
 @pytest.fixture(scope="module")
 def view(server, tmp_path_factory) -> dict[str, str]:
     """The jobs that solved and decoded one view of a wave."""
-    jobs_of = {}
-    for name, model, kind, folder in zip(("lights", "patterns"), (SolveJob, DepthJob), ("solve", "depth"),
-                                         write(tmp_path_factory.mktemp("view"))[:2], strict=True):
-        jobs_of[name], results = made(server, model, kind)
-        results.parent.mkdir(parents=True, exist_ok=True)
-        folder.rename(results)
-    return jobs_of
+    lights, patterns, *_ = write(tmp_path_factory.mktemp("view"))
+    solved = succeeded(server, SolveJob(kind="solve", capture=new_id(CAPTURE)))
+    decoded = succeeded(server, DepthJob(kind="depth", capture=new_id(CAPTURE)))
+    return {"lights": lights.rename(solved).name, "patterns": patterns.rename(decoded).name}
 
 
 def test_the_joined_maps_lie_where_the_depth_is_and_are_exported(server, client, view, tmp_path):

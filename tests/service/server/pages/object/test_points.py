@@ -5,11 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, JOB, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import DepthJob
-from service.server.database import jobs
 from stage.formats import exr
-from tests.service.server.api.job_calls import admitted
+from tests.service.server.api.job_calls import admitted, succeeded
 from tests.service.server.pages.axe import assert_accessible
 from tests.service.server.pages.conftest import SAMPLES, WITHOUT_WEBGL, await_whole, done, expect
 from tests.service.server.pages.frames import pixels
@@ -28,12 +27,11 @@ def page(small_page):
 
 
 @pytest.fixture(scope="module")
-def depth(server) -> tuple[str, str]:
+def depth(server, client) -> tuple[str, str]:
     """The job of a depth, and that of its view."""
-    with server.client() as client:
-        capture = admitted(server, client, SAMPLES / "rig")["id"]
-        made = done(server, client, {"kind": "depth", "capture": capture})
-        return made, done(server, client, {"kind": "view", "capture": capture, "maps": made})
+    capture = admitted(server, client, SAMPLES / "rig")["id"]
+    made = done(server, client, {"kind": "depth", "capture": capture})
+    return made, done(server, client, {"kind": "view", "capture": capture, "maps": made})
 
 
 @pytest.fixture
@@ -47,7 +45,7 @@ def picture(page) -> np.ndarray:
     return pixels(page, "cloud.picture().pixels")
 
 
-def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsure_can_be_hidden(cloud, server, depth):
+def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsure_can_be_hidden(cloud, client, depth):
     pictures = []
     for name in ("depth", "confidence", "photograph"):
         cloud.get_by_label("Colour by").select_option(name)
@@ -57,8 +55,7 @@ def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsur
     for other in pictures[1:]:
         assert np.array_equal(pictures[0][:, 3] > 0, other[:, 3] > 0)
         assert not np.array_equal(pictures[0], other)
-    with server.client() as client:
-        points = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["points"]
+    points = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["points"]
     assert points["unsure"] > 0
     shown = "(count) => globalThis.cloud.state().shown === count"
     cloud.wait_for_function(shown, arg=points["count"] + points["unsure"])
@@ -66,7 +63,7 @@ def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsur
     cloud.wait_for_function(shown, arg=points["count"])
 
 
-def test_a_chosen_point_is_one_of_the_depth(cloud, server, depth, tmp_path):
+def test_a_chosen_point_is_one_of_the_depth(cloud, client, depth, tmp_path):
     """The point in the middle, read by the keyboard, lies where depth.exr has it."""
     cloud.locator("canvas.scene").focus()
     cloud.keyboard.press("Enter")
@@ -74,10 +71,9 @@ def test_a_chosen_point_is_one_of_the_depth(cloud, server, depth, tmp_path):
     expect(chosen).to_have_text(numbers)
     x, y, z, away = (float(value) for value in numbers.search(chosen.inner_text().replace("−", "-")).groups())
     assert away == -z
-    with server.client() as client:
-        path = tmp_path / "depth.exr"
-        path.write_bytes(client.get(f"/v1/jobs/{depth[0]}/results/depth.exr").raise_for_status().content)
-        camera = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["camera"]
+    path = tmp_path / "depth.exr"
+    path.write_bytes(client.get(f"/v1/jobs/{depth[0]}/results/depth.exr").raise_for_status().content)
+    camera = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["camera"]
     channels, _ = exr.read(path)
     u = camera["principal_px"][0] + camera["focal_px"][0] * x / away
     v = camera["principal_px"][1] - camera["focal_px"][1] * y / away
@@ -101,27 +97,24 @@ def test_no_violation(open_to_axe, depth):
     assert_accessible(page, 390)
 
 
-def test_other_scans_are_chosen_to_be_fused(page, server, depth):
+def test_other_scans_are_chosen_to_be_fused(page, server, client, depth):
     """The capture of the other scan was deleted; its depth goes by the name of its job, which is hostile."""
-    other, name = new_id(JOB), "<img src=x onerror=alert(1)> other side"
+    name = "<img src=x onerror=alert(1)> other side"
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
-    with server.database() as database:
-        database.transact(lambda connection: jobs.insert(
-            connection, project="default", request=DepthJob(kind="depth", capture=new_id(CAPTURE), name=name), finished=other))
-    with server.client() as client:
-        capture = client.get(f"/v1/jobs/{depth[0]}").json()["request"]["capture"]
-        page.goto(f"/object/{capture}")
-        page.get_by_text("Fuse with other scans").click()
+    other = succeeded(server, DepthJob(kind="depth", capture=new_id(CAPTURE), name=name)).name
+    capture = client.get(f"/v1/jobs/{depth[0]}").json()["request"]["capture"]
+    page.goto(f"/object/{capture}")
+    page.get_by_text("Fuse with other scans").click()
+    page.get_by_role("button", name="Find the poses").click()
+    page.get_by_text("Choose at least one other scan.").wait_for()
+    page.get_by_label(name, exact=True).check()
+    with page.expect_response(lambda answer: answer.request.method == "POST" and answer.url.endswith("/v1/jobs")) as answered:
         page.get_by_role("button", name="Find the poses").click()
-        page.get_by_text("Choose at least one other scan.").wait_for()
-        page.get_by_label(name, exact=True).check()
-        with page.expect_response(lambda answer: answer.request.method == "POST" and answer.url.endswith("/v1/jobs")) as answered:
-            page.get_by_role("button", name="Find the poses").click()
-        assert answered.value.status == 202
-        made = answered.value.json()
-        assert made["request"]["kind"] == "register" and made["request"]["depths"] == [depth[0], other]
-        page.locator(f"a[href='/jobs/{made['id']}']").first.wait_for()
-        client.post(f"/v1/jobs/{made['id']}/cancel")
-        server.wait(client, f"/v1/jobs/{made['id']}", ("cancelled", "failed"))
-        for each in (made["id"], other):  # other tests share the server
-            client.delete(f"/v1/jobs/{each}").raise_for_status()
+    assert answered.value.status == 202
+    made = answered.value.json()
+    assert made["request"]["kind"] == "register" and made["request"]["depths"] == [depth[0], other]
+    page.locator(f"a[href='/jobs/{made['id']}']").first.wait_for()
+    client.post(f"/v1/jobs/{made['id']}/cancel")
+    server.wait(client, f"/v1/jobs/{made['id']}", ("cancelled", "failed"))
+    for each in (made["id"], other):  # other tests share the server
+        client.delete(f"/v1/jobs/{each}").raise_for_status()
