@@ -223,58 +223,61 @@ def test_without_a_calibration_the_columns_are_decoded_all_the_same(relit, tmp_p
     assert mask[LIT].mean() > 0.97 and np.abs(channels["projector.U"] - U)[mask].max() < 0.05
 
 
-@pytest.fixture(scope="module")
-def pair():
-    """Both views of a tilted plane and a sphere under dots, whether the second camera sees the place, and what is recorded."""
+DARK = np.zeros((stereo.CAMERA.height, stereo.CAMERA.width), np.uint8)
+
+
+def write_views(folder, *names, images=(DARK, DARK)):
+    """One image of each of two cameras, in folders of these names."""
+    for name, image in zip(names, images, strict=True):
+        write_image(folder / name / f"{name}_frame.png", image)
+
+
+@first_short("kind", ["two files", "JSON"])
+def test_calibrations_of_two_cameras(relit, tmp_path, kind):
+    """What cv2.stereoCalibrate found, as OpenCV's sample stereo_calib writes it in two files, and as a program in another language does."""
+    write_views(tmp_path, "cam0", "cam.1")
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, stereo.OTHER), pose=stereo.POSE)
+    found = read_matrices(rig)
+    words = "import", "stereo", tmp_path / "cam0", tmp_path / "cam.1", tmp_path / "pair", "--unit-m", "0.001", "--calibration"
+    if kind == "JSON":
+        given = [tmp_path / "rig.json"]
+        given[0].write_text(json.dumps({name: matrix.tolist() for name, matrix in found.items()}))
+    else:
+        for name, own in (("intrinsics.yml", OPENCV[:4]), ("extrinsics.yml", OPENCV[4:])):
+            file = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+            for key in own:
+                file.write(key, found[key])
+            file.release()
+        relit(*words, rig, "--extrinsics", tmp_path / "intrinsics.yml").refused("intrinsics.yml")
+        given = [tmp_path / "intrinsics.yml", "--extrinsics", tmp_path / "extrinsics.yml"]
+    assert f"{np.linalg.norm(stereo.POSE[:3, 3]):.4g} m from the first camera" in relit(*words, *given).well()
+    other, truth = Capture.open(tmp_path / "pair").manifest.other_cameras[0], stereo.OTHER
+    assert other.name == "cam.1"
+    np.testing.assert_allclose(other.camera_from_other, stereo.POSE, atol=1e-12)
+    np.testing.assert_allclose((*other.focal_px, *other.principal_px), (truth.focal, truth.focal, *truth.principal), atol=1e-9)
+
+
+@pytest.mark.long
+def test_two_cameras_have_the_true_depth_in_two_commands(relit, tmp_path):
+    """Both views of a tilted plane and a sphere under dots."""
     parts, dots = (Wall((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.6), Ball((0.08, -0.04, -0.95), 0.11, 0.6)), [stereo.dots(100, cell=3)]
     left, right = (stereo.render(parts, dots, *camera, side=2) for camera in ((stereo.CAMERA,), (stereo.OTHER, stereo.POSE)))
     random = np.random.default_rng(0)
-    return left, stereo.visible_to(parts, left.points, stereo.POSE), [stereo.recorded(view.images[0], random) for view in (left, right)]
-
-
-@first_short("kind", ["two files", "one file", "JSON"])
-def test_two_cameras(relit, tmp_path, pair, kind):
-    """Two folders and what cv2.stereoCalibrate found: true depth in two commands, whatever the images are called."""
-    left, visible, recorded = pair
-    for folder, image in zip(("cam0", "cam.1"), recorded, strict=True):
-        write_image(tmp_path / folder / f"{folder}_frame.png", image)
+    write_views(tmp_path, "a", "b", images=[stereo.recorded(view.images[0], random) for view in (left, right)])
     rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, stereo.OTHER), pose=stereo.POSE)
-    words = ["--calibration", rig]
-    if kind != "one file":
-        found = read_matrices(rig)
-        if kind == "JSON":
-            words[1] = tmp_path / "rig.json"
-            words[1].write_text(json.dumps({name: matrix.tolist() for name, matrix in found.items()}))
-        else:  # as OpenCV's sample stereo_calib writes them
-            for name, own in (("intrinsics.yml", OPENCV[:4]), ("extrinsics.yml", OPENCV[4:])):
-                file = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
-                for key in own:
-                    file.write(key, found[key])
-                file.release()
-            words = ["--calibration", rig, "--extrinsics", tmp_path / "intrinsics.yml"]
-            relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam.1", tmp_path / "pair", *words).refused("intrinsics.yml")
-            words = ["--calibration", tmp_path / "intrinsics.yml", "--extrinsics", tmp_path / "extrinsics.yml"]
-    out = relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam.1", tmp_path / "pair", *words, "--unit-m", "0.001").well()
-    assert f"{np.linalg.norm(stereo.POSE[:3, 3]):.4g} m from the first camera" in out
-    manifest = Capture.open(tmp_path / "pair").manifest
-    other, truth = manifest.other_cameras[0], stereo.OTHER
-    np.testing.assert_allclose(other.camera_from_other, stereo.POSE, atol=1e-12)
-    np.testing.assert_allclose((*other.focal_px, *other.principal_px), (truth.focal, truth.focal, *truth.principal), atol=1e-9)
-    if kind != "one file":  # alike from here on
-        return
-    assert other.name == "cam.1"
+    relit.done("import", "stereo", tmp_path / "a", tmp_path / "b", tmp_path / "pair", "--unit-m", "0.001", "--calibration", rig)
     maps, *_ = relit.depth(tmp_path / "pair")
+    visible = stereo.visible_to(parts, left.points, stereo.POSE)
     off = np.abs(maps.depth - left.depth)[maps.mask & visible]  # a pixel of disparity is 19 to 27 mm at 1 to 1.2 m
     assert maps.mask[visible].mean() > 0.7 and np.median(off) < 0.006 and (off > 0.03).mean() < 0.02
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0])
-def test_calibrations_at_another_size_of_images_are_named(relit, tmp_path, pair, factor):
+def test_calibrations_at_another_size_of_images_are_named(relit, tmp_path, factor):
     """Focal lengths and principal points of images that were binned since; without a word their depths are refused or wrong."""
     larger = [device._replace(width=round(factor * device.width), height=round(factor * device.height), focal=factor * device.focal)
               for device in (stereo.CAMERA, stereo.OTHER)]
-    for folder, image in zip(("a", "b"), pair[2], strict=True):
-        write_image(tmp_path / folder / "0.png", image)
+    write_views(tmp_path, "a", "b")
     words = ("import", "stereo", tmp_path / "a", tmp_path / "b", "--unit-m", "0.001", "--calibration")
     out = relit(*words, write_calibration(tmp_path / "rig.yml", OPENCV, devices=larger, pose=stereo.POSE)).well()
     named = [f"{field}.principal_px: the calibration is of images of 320x240 px" for field in ("camera", "other_cameras[0]")]
@@ -322,8 +325,7 @@ def test_pairs_may_be_numbered_each_in_its_own_way(relit, tmp_path):
 
 @pytest.mark.parametrize("unit", ["0.001", "1e-9"], ids=["no translation", "a wrong unit"])
 def test_two_cameras_in_one_place_are_refused(relit, tmp_path, unit):
-    for name in ("a", "b"):
-        write_image(tmp_path / name / "0.png", np.zeros((stereo.CAMERA.height, stereo.CAMERA.width), np.uint8))
+    write_views(tmp_path, "a", "b")
     pose = stereo.POSE.copy()
     if unit == "0.001":
         pose[:3, 3] = 0

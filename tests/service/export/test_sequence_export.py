@@ -35,7 +35,7 @@ def walk(tmp_path_factory):
     mask[3:25, 3:20] = 255
     write_image(folder / "in" / "step01" / "mask.png", mask)
     edit_manifest(folder / "in" / "step01", mask="mask.png")
-    solve_sequence(SolveRequest(capture=folder / "in", out=folder / "out", method=Method.ROBUST, device="cpu"))
+    solve_sequence(SolveRequest(capture=folder / "in", out=folder / "out", method=Method.LAMBERT, device="cpu"))
     return folder / "out"
 
 

@@ -94,7 +94,7 @@ def keyed_database(keyed: Server):
 
 
 @pytest.fixture(scope="module")
-def worker_lives(server: Server, client, owl):
+def worker_lives(server: Server, client, dome):
     """Nothing that the tests of a module send costs the worker its life, or more memory than it may have."""
     before = workers(server)
     assert before

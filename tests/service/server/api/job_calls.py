@@ -6,7 +6,7 @@ from pathlib import Path
 import httpx2
 
 from service.requests.base.base import JobRequest
-from service.requests.base.identifiers import JOB, new_id
+from service.requests.base.identifiers import CAPTURE, JOB, new_id
 from service.server.database import intakes, jobs
 from service.server.database.engine import Database
 from service.server.storage import layout
@@ -86,6 +86,15 @@ def admitted(server: Server, client: httpx2.Client, folder: Path, state: str = "
     found = server.wait(client, f"/v1/{kind}/{made['id']}", ("ready", "refused"))
     assert found["state"] == state, found
     return found
+
+
+def checked(server: Server, folder: Path, **facts: object) -> str:
+    """Put a registered capture there that is ready, though no worker has checked it."""
+    with server.database() as database:
+        made = database.transact(lambda connection: intakes.insert(
+            connection, project="default", kind=CAPTURE, name=folder.name, folder=folder))
+        intakes.accept(database, made, facts)
+    return made
 
 
 def accepted(database: Database, client: httpx2.Client, project: str, folder: Path) -> str:

@@ -11,9 +11,10 @@ from service.requests.jobs import CheckJob
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs
 from service.server.database.jobs import Claim
+from tests.marks import first_short
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import admitted, finish, finished, made_by, refused, report_of, submit
+from tests.service.server.api.job_calls import admitted, checked, finish, finished, made_by, refused, report_of, submit
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server.prepared import opened
 
@@ -67,7 +68,7 @@ def test_a_registered_capture_is_checked_again_when_mended_and_not_deleted_while
     assert client.delete(f"/v1/captures/{made}").status_code == 204
 
 
-@pytest.mark.parametrize("kind", ["captures", "environments"])
+@first_short("kind", ["captures", "environments"])
 def test_what_has_no_file_is_not_checked_and_a_check_begins_again_by_another_validation_alone(server, client, kind):
     made = client.post(f"/v1/{kind}", json={"name": "empty"}).json()["id"]
     refused(client.post(f"/v1/{kind}/{made}/validate"), 409, "has no files yet")
@@ -93,12 +94,11 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
             assert jobs.begin(database, claim)
             assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0)) == jobs.FAILED
         found = intakes.find(database, capture, "p")
-        assert found is not None and found["state"] == "refused"
+        assert found["state"] == "refused"
         assert ("cancelled" if end == "cancelled" else "lost 1 workers") in found["problem"]
         assert database.transact(lambda connection: intakes.begin_check(connection, capture))
         assert not database.transact(lambda connection: jobs.cancel(connection, job))
-        found = intakes.find(database, capture, "p")
-        assert found is not None and found["state"] == "checking"  # the check that ended before has no say in this one
+        assert intakes.find(database, capture, "p")["state"] == "checking"  # the check that ended before has no say in this one
 
 
 @pytest.mark.long
@@ -163,7 +163,7 @@ REGION = {"body": {"type": "TextualBody", "value": "A repair"},
 @pytest.fixture(scope="module")
 def noted(server, client, registered) -> str:
     """A capture of 8 × 8 pixels with two annotations."""
-    capture = admitted(server, client, write_capture(registered / "noted"))["id"]
+    capture = checked(server, write_capture(registered / "noted"), resolution=[8, 8])
     for each in (POINT, REGION):
         made = client.post(f"/v1/captures/{capture}/annotations", json=each)
         assert made.status_code == 201 and made.json()["id"] == made.headers["location"]
@@ -192,8 +192,8 @@ def test_what_is_no_annotation_of_the_image_is_refused(client, noted, change, wo
 
 
 @pytest.mark.long
-def test_a_capture_has_so_many_and_no_more(client, noted, monkeypatch, server):
-    full = admitted(server, client, SAMPLES / "lambert")["id"]
+def test_a_capture_has_so_many_and_no_more(client, server):
+    full = checked(server, SAMPLES / "lambert", resolution=[128, 128])
     path = f"/v1/captures/{full}/annotations"
     with server.database() as database:
         for _ in range(intakes.MOST_ANNOTATIONS):
@@ -206,7 +206,7 @@ def test_a_capture_has_so_many_and_no_more(client, noted, monkeypatch, server):
 
 
 def test_the_client_adds_and_deletes_them(server, client, registered):
-    capture = admitted(server, client, write_capture(registered / "annotated"))["id"]
+    capture = checked(server, write_capture(registered / "annotated"), resolution=[8, 8])
     with Client(server.url) as relit:
         point, region = relit.annotations.add(capture, "here", 2, 2.5), relit.annotations.add(capture, "there", 1, 2, 3, 4)
         assert relit.annotations.page(capture).items == [point, region] and region.box() == (1, 2, 3, 4)
