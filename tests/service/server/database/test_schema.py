@@ -1,6 +1,5 @@
 """Databases of older programs, upgraded when they are opened; and databases that are refused."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from service.server.database import audit, intakes, jobs, keys, schema, tables, 
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import REVISIONS, is_current, require_current, upgrade
 from service.server.jobs.queue import prepare
+from tests.service.server.prepared import opened
 
 OLDEST = Path(__file__).parent / "schema_0009.sql"
 CAPTURE, RECEIVING, UPLOAD = "cap_0123456789abcdefghjk", "cap_1123456789abcdefghjk", "upl_0123456789abcdefghjk"
@@ -94,17 +94,20 @@ def test_a_new_database_equals_an_upgraded_one(settings, database):
     assert differences(database) == []
 
 
-def test_the_revisions_are_those_of_alembic_and_an_open_database_needs_none_of_it(settings, database):
+def test_the_revisions_are_those_of_alembic(database):
     upgrade(database)
     script = ScriptDirectory(str(Path(schema.__file__).parent / "migrations"))
     with database.engine.connect() as connection:
         assert MigrationContext.configure(connection, opts={"version_table": REVISIONS}).get_current_revision() == script.get_current_head()
     assert len(list(script.walk_revisions())) == len(list(Path(script.versions).glob("*.py")))
-    url = {} if settings.database_url is None else {"RELIT_DATABASE_URL": settings.database_url}
-    code = ("import sys; from service.server.base.settings import Settings; from service.server.database.engine import connect; "
-            "from service.server.database.schema import upgrade; upgrade(connect(Settings().sqlalchemy_url)); "
-            "assert 'alembic' not in sys.modules")
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | url | {"RELIT_DATA": str(settings.data)})
+
+
+def test_an_open_database_needs_nothing_of_alembic(tmp_path):
+    with opened(Settings(data=tmp_path)) as made:
+        url = made.engine.url.render_as_string()
+    code = ("import sys; from service.server.database.engine import connect; from service.server.database.schema import upgrade; "
+            f"upgrade(connect({url!r})); assert 'alembic' not in sys.modules")
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_an_upgrade_that_fails_changes_nothing(yesterday, monkeypatch):

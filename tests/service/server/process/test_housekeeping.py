@@ -183,18 +183,6 @@ def test_what_is_half_removed_or_made_again_of_a_deleted_job_is_removed(house):
     assert stray.exists()
 
 
-def test_one_piece_that_fails_does_not_stop_the_others(house, monkeypatch):
-    def fail(*_arguments: object) -> None:
-        raise OSError("no such disk")
-
-    old = house.job()
-    house.now += 2 * DAYS * DAY_S
-    monkeypatch.setattr(type(house.storage), "remove", fail)
-    capture = house.cache(new_id(CAPTURE))
-    house.round()
-    assert not capture.exists() and jobs.find(house.database, old) is None
-
-
 def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypatch):
     """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
     bad, good = house.job(), house.job()
