@@ -185,13 +185,13 @@ def test_what_is_half_removed_or_made_again_of_a_deleted_job_is_removed(house):
 
 def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypatch):
     """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
-    bad, good = house.job(), house.job()
+    bad, away, good = house.job(), house.job(), house.job()
     house.now += 2 * DAYS * DAY_S
-    remove = jobs.remove
+    remove, failing = jobs.remove, {bad: ValueError("no such character"), away: OSError("no such disk")}
 
     def fail(connection, job):
-        if job == bad:
-            raise ValueError("no such character")
+        if job in failing:
+            raise failing[job]
         return remove(connection, job)
 
     monkeypatch.setattr(jobs, "remove", fail)
@@ -200,7 +200,8 @@ def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypa
     stale = house.cache(new_id(CAPTURE))
     house.round()
     house.round()
-    assert jobs.find(house.database, bad) and jobs.find(house.database, good) is None and not stale.exists()
+    left = {row["id"] for row in jobs.latest(house.database, PROJECT, limit=9)}
+    assert left == {bad, away} and not stale.exists()
     assert logged == [("housekeeping failed", bad)]
 
 
