@@ -9,6 +9,7 @@ from service.publish.publish import publish
 from service.requests.publish import PublishRequest
 from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import edit_frame, files_in, make_scene, write_capture
+from tests.service.recording import Recording
 
 IIIF = ["--as", "iiif", "--url", "https://museum.org/cap"]
 
@@ -83,13 +84,11 @@ def test_an_interruption_keeps_the_older_publication(relit, tmp_path, cap):
     relit.done("publish", cap, "--to", tmp_path / "out", *IIIF)
     before = files_in(tmp_path / "out")
 
-    class Interrupting:
+    class Interrupting(Recording):
         def stage(self, name, total):
+            super().stage(name, total)
             if name == "write":
                 raise KeyboardInterrupt
-
-        def advance(self, done):
-            pass
 
     with pytest.raises(KeyboardInterrupt):
         publish(PublishRequest(capture=cap, out=tmp_path / "out", kind="web"), Interrupting())

@@ -19,8 +19,10 @@ from tests.reference.gradient import ggx, lambert
 from tests.scenes import horn, near_lights
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.owl import write_small_owl
+from tests.service.recording import Recording
 from tests.service.solve.methods import test_gradient as gradient
 from tests.service.solve.methods import test_reference as reference
+from tests.service.waiting import at_once
 
 BAND_BYTES, BATCH_BYTES, SEARCH_BYTES = 1 << 13, 1 << 15, 1 << 19
 """Memory of a band, of a batch, and of a batch for the searches in tables, which keep much for each pixel: small enough that every capture
@@ -126,17 +128,11 @@ def test_an_error_on_one_device_ends_the_solve(tmp_path, small_pieces, pair, mon
     assert_nothing_is_left(tmp_path / "out")
 
 
-class InterruptedProgress:
+class InterruptedProgress(Recording):
     """A progress that is interrupted as Ctrl-C does it: in the thread of the caller, while the devices work."""
 
-    def __init__(self) -> None:
-        self.name = ""
-
-    def stage(self, name: str, total: int) -> None:
-        self.name = name
-
     def advance(self, done: int) -> None:
-        if self.name == "search":
+        if self.stages[-1].name == "search":
             raise KeyboardInterrupt
 
 
@@ -213,22 +209,12 @@ def test_commands_for_one_device_refuse_two(relit, tmp_path, command):
 
 def test_threads_share_what_is_made_once():
     """A kernel that two devices ask for at the same moment is defined by one of them."""
-    made, start = [], threading.Barrier(4, timeout=30)
+    made = []
 
     @devices.once
     def make(name: str) -> object:
         made.append(name)
         return object()
 
-    got = []
-
-    def ask() -> None:
-        start.wait()
-        got.append(make("kernel"))
-
-    threads = [threading.Thread(target=ask) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    got = at_once(4, lambda _: make("kernel"))
     assert made == ["kernel"] and all(each is got[0] for each in got)

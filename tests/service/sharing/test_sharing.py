@@ -15,6 +15,7 @@ from service.solve.base import batches
 from service.solve.solve import help_solve, solve
 from stage.stack import stack
 from tests.service.owl import write_small_owl
+from tests.service.recording import Recording
 from tests.service.sharing.test_several_devices import BAND_BYTES, BATCH_BYTES, CAPTURES, SEARCH_BYTES, distant, extended, with_ball
 
 
@@ -66,32 +67,6 @@ class Part:
         return True
 
 
-class Quiet:
-    """A progress of a worker that helps."""
-
-    def stage(self, name: str, total: int) -> None:
-        pass
-
-    def advance(self, done: int) -> None:
-        pass
-
-
-class Counting:
-    """A progress that keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.told: dict[str, list[int]] = {}
-
-    def stage(self, name: str, total: int) -> None:
-        self.name = name
-        self.told[name] = []
-        self.total = total
-
-    def advance(self, done: int) -> None:
-        self.told[self.name].append(done)
-        assert done <= max(self.total, 100)
-
-
 @pytest.fixture
 def small_pieces(monkeypatch):
     monkeypatch.setattr(stack, "BAND_BYTES", BAND_BYTES)
@@ -99,13 +74,13 @@ def small_pieces(monkeypatch):
     monkeypatch.setattr(sharing, "LOOK_S", 0.01)
 
 
-def shared_solve(request: dict, out: Path, store: Store) -> tuple[Path, Counting]:
+def shared_solve(request: dict, out: Path, store: Store) -> tuple[Path, Recording]:
     """Solve with a second worker beside, which begins when it is asked to."""
-    errors, helpers, progress = [], [], Counting()
+    errors, helpers, progress = [], [], Recording()
 
     def help_out() -> None:
         try:
-            help_solve(SolveRequest(**request, out=out / "two", device="cpu"), Quiet(), SharedSolve(store.of("two"), leads=False))
+            help_solve(SolveRequest(**request, out=out / "two", device="cpu"), Recording(), SharedSolve(store.of("two"), leads=False))
         except BaseException as error:
             errors.append(error)
 
@@ -136,7 +111,7 @@ def test_two_workers_find_the_same_to_the_last_bit_as_one(tmp_path, small_pieces
     maps, progress = shared_solve(request, tmp_path / "shared", store)
     assert maps.read_bytes() == alone.maps_path.read_bytes()
     assert store.done_by("one") and store.done_by("two")
-    assert all(told == sorted(told) for told in progress.told.values())
+    assert all(stage.told == sorted(stage.told) and max(stage.told, default=0) <= max(stage.total, 100) for stage in progress.stages)
     reports = [json.loads((folder / "report.json").read_text()) for folder in (tmp_path / "alone", tmp_path / "shared")]
     assert reports[0].get("found") == reports[1].get("found") and reports[0]["pixels"] == reports[1]["pixels"]
 
