@@ -5,15 +5,22 @@ Chromium is Debian's. Without it these tests are skipped, unless RELIT_TEST_PAGE
 
 import io
 import os
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import httpx2
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks.clients import installed
+from service.server.base.settings import Settings
+from service.server.process.connections import ConnectionLimits
+from service.server.process.serve import http_server
+from tests.service.server.api.asgi import app_of
 from tests.service.server.api.job_calls import admitted, finish, submit
 from tests.service.server_process import Server, serving
 from tests.service.waiting import until
@@ -45,6 +52,25 @@ PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with serving(tmp_path_factory.mktemp("pages"), "--anonymous", "--device", "cpu", sabotage="long", roots=str(SAMPLES)) as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def client(server: Server) -> Iterator[httpx2.Client]:
+    with server.client() as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def without_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a service in this process, for tests that make up what its API says, or ask for nothing of it."""
+    settings = Settings(data=tmp_path_factory.mktemp("without_worker"), anonymous=True)
+    with app_of(settings) as app, socket.create_server(("127.0.0.1", 0)) as listening:
+        running = http_server(app, settings, ConnectionLimits(100, 100))
+        thread = threading.Thread(target=running.run, kwargs={"sockets": [listening]})
+        thread.start()
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        running.should_exit = True
+        thread.join()
 
 
 @pytest.fixture(scope="session")
@@ -120,9 +146,16 @@ def opened_page(browser, **options):
 
 @pytest.fixture
 def page(browser, server: Server):
+    """A page of the server with the samples."""
+    with page_of(browser, server.url) as opened:
+        yield opened
+
+
+@contextmanager
+def page_of(browser, url: str):
     """A page of 1280 × 900 px, which may ask no other server."""
-    own, others = (f"{server.url}/", "blob:", "data:"), []
-    with opened_page(browser, base_url=server.url, viewport={"width": 1280, "height": 900}) as opened:
+    own, others = (f"{url}/", "blob:", "data:"), []
+    with opened_page(browser, base_url=url, viewport={"width": 1280, "height": 900}) as opened:
         opened.on("request", lambda request: None if request.url.startswith(own) else others.append(request.url))
         yield opened
     assert others == []
@@ -180,6 +213,11 @@ class Solved:
         if solve is not None:
             self.pages |= {"job": f"/jobs/{solve}", "maps": f"/maps/{solve}"}
 
+    def open(self, page, name: str) -> None:
+        """Open a page, and wait until it is whole."""
+        page.goto(self.pages[name])
+        self.wait_for_content(page, name)
+
     def wait_for_content(self, page, name: str) -> None:
         """Wait until a page shows what it is for, and all else of it."""
         content = {"home": ".card canvas", "machines": "#audit tbody tr", "captures": "#captures a", "jobs": "#jobs tbody tr",
@@ -201,12 +239,11 @@ def done(server: Server, client, request: dict) -> str:
     return finish(server, client, submit(client, **request))["id"]
 
 
-def prepared(server: Server, name: str, options: dict | None) -> Solved:
+def prepared(server: Server, client, name: str, options: dict | None) -> Solved:
     """A sample, registered, solved unless `options` is None, and prepared for the pages."""
-    with server.client() as client:
-        capture = admitted(server, client, SAMPLES / name)["id"]
-        done(server, client, {"kind": "view", "capture": capture})
-        return Solved(server, capture, None if options is None else solved_maps(server, client, capture, options))
+    capture = admitted(server, client, SAMPLES / name)["id"]
+    done(server, client, {"kind": "view", "capture": capture})
+    return Solved(server, capture, None if options is None else solved_maps(server, client, capture, options))
 
 
 def solved_maps(server: Server, client, capture: str, options: dict) -> str:
@@ -217,27 +254,23 @@ def solved_maps(server: Server, client, capture: str, options: dict) -> str:
 
 
 @pytest.fixture(scope="session")
-def solved(server: Server) -> Solved:
-    return prepared(server, "lambert", {"method": "lambert", "max_sigma": MAX_SIGMA})
+def solved(server: Server, client) -> Solved:
+    return prepared(server, client, "lambert", {"method": "lambert", "max_sigma": MAX_SIGMA})
 
 
 @pytest.fixture(scope="session")
-def owl(server: Server) -> Solved:
+def owl(server: Server, client) -> Solved:
     """The sample that `make serve` opens on; its material is solved for pictures of the documentation alone."""
-    return prepared(server, "owl", {} if PICTURES else None)
+    return prepared(server, client, "owl", {} if PICTURES else None)
 
 
 @pytest.fixture(scope="session")
-def material(server: Server, solved: Solved, owl: Solved) -> Solved:
+def material(server: Server, client, solved: Solved, owl: Solved) -> Solved:
     """A capture whose material is solved: the sample where that is, else the small one."""
-    if owl.solve is not None:
-        return owl
-    with server.client() as client:
-        return Solved(server, solved.capture, solved_maps(server, client, solved.capture, {}))
+    return owl if owl.solve is not None else Solved(server, solved.capture, solved_maps(server, client, solved.capture, {}))
 
 
 @pytest.fixture(scope="session")
-def sky(server: Server) -> str:
+def sky(server: Server, client) -> str:
     """An environment, registered and ready."""
-    with server.client() as client:
-        return admitted(server, client, SAMPLES / "owl" / "environment.exr", kind="environments")["id"]
+    return admitted(server, client, SAMPLES / "owl" / "environment.exr", kind="environments")["id"]

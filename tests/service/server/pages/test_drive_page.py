@@ -13,12 +13,11 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def driven(server, sky, tmp_path_factory) -> str:
+def driven(server, client, sky, tmp_path_factory) -> str:
     """The job that drove a dome of 64 lamps under the turning environment of the sample."""
     rig = write_rig(tmp_path_factory.mktemp("rig") / "dome.json", fibonacci_sphere(64), irradiance=4.0)
-    with server.client() as client:
-        return done(server, client, {"kind": "drive", "rig": rig, "environment": sky,
-                                     "options": {"frames": "11-14", "spin_degrees": 360.0, "auto_exposure": True}})
+    return done(server, client, {"kind": "drive", "rig": rig, "environment": sky,
+                                 "options": {"frames": "11-14", "spin_degrees": 360.0, "auto_exposure": True}})
 
 
 def shown(page) -> dict[str, list[float]]:
@@ -27,9 +26,8 @@ def shown(page) -> dict[str, list[float]]:
     return {name: [float(level.removesuffix(" %")) for level in levels.split(", ")] for name, levels in titles}
 
 
-def test_the_lamps_of_each_frame_and_the_files(page, server, driven, tmp_path):
-    with server.client() as client:
-        cues = client.get(f"/v1/jobs/{driven}/results/cues.json").raise_for_status()
+def test_the_lamps_of_each_frame_and_the_files(page, client, driven, tmp_path):
+    cues = client.get(f"/v1/jobs/{driven}/results/cues.json").raise_for_status()
     page.goto(f"/jobs/{driven}")
     page.locator("#cues").click()
     page.get_by_role("heading", name="Drive of dome").wait_for()

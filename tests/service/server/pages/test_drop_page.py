@@ -19,12 +19,11 @@ def photographs(tmp_path):
     return write_photographs(tmp_path / tmp_path.name)
 
 
-def captures_named(server, name: str) -> list[dict]:
-    with server.client() as client:
-        return [item for item in client.get("/v1/captures", params={"limit": 500}).json()["items"] if item["name"] == name]
+def captures_named(client, name: str) -> list[dict]:
+    return [item for item in client.get("/v1/captures", params={"limit": 500}).json()["items"] if item["name"] == name]
 
 
-def test_photographs_are_a_capture_after_two_clicks_and_dropped_twice_they_are_one(server, page, photographs):
+def test_photographs_are_a_capture_after_two_clicks_and_dropped_twice_they_are_one(client, page, photographs):
     count = len(list(photographs.glob("*.png")))
     page.goto("/captures")
     page.set_input_files("#folder", photographs)
@@ -38,11 +37,11 @@ def test_photographs_are_a_capture_after_two_clicks_and_dropped_twice_they_are_o
     page.goto("/captures")
     page.set_input_files("#folder", photographs)
     page.get_by_role("link", name="Look at it").wait_for(timeout=UPLOAD_MS)
-    found, = captures_named(server, photographs.name)
+    found, = captures_named(client, photographs.name)
     assert (found["state"], found["facts"]["frames"], sent) == ("ready", count, [])
 
 
-def test_another_folder_of_the_same_name_is_another_capture(server, page, photographs):
+def test_another_folder_of_the_same_name_is_another_capture(client, page, photographs):
     page.goto("/captures")
     page.set_input_files("#folder", photographs)
     page.get_by_role("button", name="Import", exact=True).click(timeout=UPLOAD_MS)
@@ -52,10 +51,10 @@ def test_another_folder_of_the_same_name_is_another_capture(server, page, photog
     page.goto("/captures")
     page.set_input_files("#folder", photographs)
     page.get_by_role("button", name="Import", exact=True).wait_for(timeout=UPLOAD_MS)
-    assert sorted(item["state"] for item in captures_named(server, photographs.name)) == ["ready", "receiving"]
+    assert sorted(item["state"] for item in captures_named(client, photographs.name)) == ["ready", "receiving"]
 
 
-def test_what_files_do_not_say_is_asked_for(server, page, tmp_path):
+def test_what_files_do_not_say_is_asked_for(client, page, tmp_path):
     folder = write_four_phases(tmp_path / tmp_path.name)
     page.goto("/captures")
     page.set_input_files("#folder", folder)
@@ -68,10 +67,10 @@ def test_what_files_do_not_say_is_asked_for(server, page, tmp_path):
     field.fill("60e6")
     page.get_by_role("button", name="Import", exact=True).click()
     page.wait_for_url("**/object/cap_*", timeout=UPLOAD_MS)
-    assert [item["state"] for item in captures_named(server, folder.name)] == ["ready"]
+    assert [item["state"] for item in captures_named(client, folder.name)] == ["ready"]
 
 
-def test_names_that_are_markup_are_text(server, page, photographs):
+def test_names_that_are_markup_are_text(page, photographs):
     """The names of the folder and of its table are shown; the names of images are not used where they cannot be stored."""
     folder = photographs.with_name("<img src=x onerror=alert(1)>")
     shutil.move(photographs, folder)
@@ -86,7 +85,7 @@ def test_names_that_are_markup_are_text(server, page, photographs):
     expect(page.locator("main img")).to_have_count(0)
 
 
-def test_a_lost_server_is_told_and_waited_for(server, page, photographs):
+def test_a_lost_server_is_told_and_waited_for(client, page, photographs):
     lost = []
     page.route("**/v1/captures/*/files", lambda route: (lost.append(1), route.abort("connectionreset")) if len(lost) < 3 and
                route.request.method == "POST" else route.continue_())
@@ -103,4 +102,4 @@ def test_a_lost_server_is_told_and_waited_for(server, page, photographs):
     page.get_by_text("The server cannot be reached. The upload waits").wait_for(timeout=UPLOAD_MS)
     page.locator("#close").dispatch_event("click")  # what is under way stays in sight
     page.get_by_role("button", name="Import", exact=True).wait_for(timeout=UPLOAD_MS)
-    assert len(captures_named(server, photographs.name)) == 1
+    assert len(captures_named(client, photographs.name)) == 1

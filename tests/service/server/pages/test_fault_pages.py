@@ -3,6 +3,7 @@
 import re
 import shutil
 
+import httpx2
 import pytest
 
 from service.client import Client
@@ -11,6 +12,7 @@ from tests.scenes.captures import write_capture
 from tests.service.server.pages.axe import assert_accessible
 from tests.service.server.pages.conftest import SAMPLES, expect, opened_page
 from tests.service.server_process import new_key, revoke
+from tests.service.waiting import PATIENCE_S
 
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 HTML = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -18,8 +20,8 @@ FAULTS = {"/nothing": 404, "/captures/%3Cscript%3E": 422, f"/v1/jobs/{JOB}": 404
 
 
 @pytest.mark.parametrize("path", FAULTS)
-def test_a_browser_gets_a_page_and_a_program_a_problem(server, path):
-    with server.client() as client:
+def test_a_browser_gets_a_page_and_a_program_a_problem(without_worker, path):
+    with httpx2.Client(base_url=without_worker, timeout=PATIENCE_S) as client:
         page, problem = client.get(path, headers=HTML), client.get(path)
         assert page.status_code == problem.status_code == FAULTS[path]
         assert page.headers["Content-Type"].startswith("text/html") and "default-src 'none'" in page.headers["Content-Security-Policy"]

@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from service.requests.keys import Scope
-from tests.service.server.pages.conftest import await_whole, expect, opened_page, seen
+from tests.service.server.pages.conftest import await_whole, expect, opened_page, page_of, seen
 from tests.service.server_process import serving
 
 CAPTURES = 1000
@@ -28,6 +28,13 @@ def job(number: int, state: str, **values) -> dict:
     return {"id": f"job_{number:020d}", "state": state, "attempt": 1, "revision": 1, "priority": 50, "progress": None, "error": None,
             "request": {"kind": "solve", "capture": f"cap_{number:020d}", "name": ""}, "created_at": f"2026-01-01T10:00:{number:02d}Z",
             "started_at": None, "finished_at": None} | values
+
+
+@pytest.fixture
+def bare(browser, without_worker):
+    """A page of a service that has nothing."""
+    with page_of(browser, without_worker) as opened:
+        yield opened
 
 
 def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  # noqa: B006
@@ -58,60 +65,60 @@ def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  #
 
 
 @pytest.mark.long
-def test_an_asset_is_found_by_the_name_of_its_capture(page):
+def test_an_asset_is_found_by_the_name_of_its_capture(bare):
     """Its job has no name, and its card is far below; its request names the maps alone."""
-    pretend(page, [capture(number) for number in range(SHOWN + 20)])
+    pretend(bare, [capture(number) for number in range(SHOWN + 20)])
     export = job(7, "succeeded", request={"kind": "export", "maps": job(3, "succeeded")["id"], "name": "", "format": "usdz"})
     export |= {"created_at": "2025-01-01T10:00:00Z"}
-    page.route("**/v1/jobs?limit=500&state=succeeded&kind=export&kind=pipeline",
+    bare.route("**/v1/jobs?limit=500&state=succeeded&kind=export&kind=pipeline",
                lambda route: route.fulfill(json={"jobs": [export], "next": None}))
-    page.route(f"**/v1/jobs/{job(3, 'succeeded')['id']}", lambda route: route.fulfill(json=job(3, "succeeded")))
-    page.goto("/")
-    page.get_by_label("Search by name").fill("bird 3")
-    page.locator(".card", has_text="Asset").locator("h3", has_text="bird 3").wait_for()
+    bare.route(f"**/v1/jobs/{job(3, 'succeeded')['id']}", lambda route: route.fulfill(json=job(3, "succeeded")))
+    bare.goto("/")
+    bare.get_by_label("Search by name").fill("bird 3")
+    bare.locator(".card", has_text="Asset").locator("h3", has_text="bird 3").wait_for()
 
 
 @pytest.mark.long
-def test_a_thousand_captures_are_searched_sorted_and_filtered(page):
+def test_a_thousand_captures_are_searched_sorted_and_filtered(bare):
     found = [capture(number) for number in range(CAPTURES)]
     found[7] = capture(7, steps=3) | {"name": EVIL}
-    submitted = pretend(page, found)
-    page.goto("/?words=bird+99")
-    page.get_by_text(f"{sum('99' in str(number) for number in range(CAPTURES))} of {CAPTURES}").wait_for()
-    page.locator("#strip li").first.wait_for()
-    names = page.locator("#wall h3")
-    page.get_by_label("Search by name").fill("")
-    page.get_by_text(f"{CAPTURES} in all").wait_for()
-    page.wait_for_url(re.compile("/$"))
+    submitted = pretend(bare, found)
+    bare.goto("/?words=bird+99")
+    bare.get_by_text(f"{sum('99' in str(number) for number in range(CAPTURES))} of {CAPTURES}").wait_for()
+    bare.locator("#strip li").first.wait_for()
+    names = bare.locator("#wall h3")
+    bare.get_by_label("Search by name").fill("")
+    bare.get_by_text(f"{CAPTURES} in all").wait_for()
+    bare.wait_for_url(re.compile("/$"))
     expect(names).to_have_count(SHOWN)
-    page.locator("#order").select_option("name")
+    bare.locator("#order").select_option("name")
     for at in range(3):
         expect(names.nth(1 + at)).to_have_text(f"bird {at}")  # numbers by value, and the other name before them
-    page.locator("#order").select_option("oldest")
+    bare.locator("#order").select_option("oldest")
     expect(names.first).to_have_text("bird 0")
-    page.locator(".chips label", has_text="Sequences").click()
-    page.get_by_text(f"1 of {CAPTURES}").wait_for()
+    bare.locator(".chips label", has_text="Sequences").click()
+    bare.get_by_text(f"1 of {CAPTURES}").wait_for()
     expect(names).to_have_text([EVIL])
-    expect(page.locator("#wall img, #wall script")).to_have_count(0)
-    expect(page).to_have_title("Home · Relit")
-    expect(page.get_by_text("3 time steps · 96 frames · 320 × 320")).to_be_visible()
-    seen(page, lambda: submitted, "no view is prepared")
+    expect(bare.locator("#wall img, #wall script")).to_have_count(0)
+    expect(bare).to_have_title("Home · Relit")
+    expect(bare.get_by_text("3 time steps · 96 frames · 320 × 320")).to_be_visible()
+    seen(bare, lambda: submitted, "no view is prepared")
     assert [each["kind"] for each in submitted] == ["view"]  # one view is prepared at a time
-    page.reload()
-    page.get_by_text(f"1 of {CAPTURES}").wait_for()
-    expect(page.get_by_label("Sequences")).to_be_checked()
-    expect(page.locator("#order")).to_have_value("oldest")
+    bare.reload()
+    bare.get_by_text(f"1 of {CAPTURES}").wait_for()
+    expect(bare.get_by_label("Sequences")).to_be_checked()
+    expect(bare.locator("#order")).to_have_value("oldest")
 
 
-def test_jobs_say_why_they_wait_and_how_they_failed(page):
+def test_jobs_say_why_they_wait_and_how_they_failed(bare):
     progress = {"stage": "normals", "done": 3, "total": 12, "rate": 1.0, "remaining_s": 9.0}
-    pretend(page, [capture(number) | {"view": None} for number in range(1, 4)], [
+    pretend(bare, [capture(number) | {"view": None} for number in range(1, 4)], [
         job(1, "running", progress=progress), job(2, "queued"), job(3, "queued", priority=90), job(4, "queued", request={
             "kind": "depth", "capture": "cap_x", "name": EVIL}),
         job(5, "failed", error="bird: no frame can be read", finished_at="2100-01-01T00:00:00Z"),
         job(6, "failed", error="long ago", finished_at="2020-01-01T00:00:00Z")])
-    page.goto("/")
-    strip = page.locator("#strip")
+    bare.goto("/")
+    strip = bare.locator("#strip")
     strip.get_by_text("normals 3 of 12, 9.0 s left").wait_for()
     expect(strip.get_by_text("behind Solve normals and materials · bird 1, which runs")).to_have_count(1)  # of the highest priority
     strip.get_by_text("behind 2 jobs, first Solve normals and materials · bird 1, which runs").wait_for()
@@ -121,20 +128,20 @@ def test_jobs_say_why_they_wait_and_how_they_failed(page):
     expect(strip.locator("img")).to_have_count(0)
 
 
-def test_nothing_yet_says_what_to_do(page):
-    pretend(page, [])
-    page.goto("/")
-    page.get_by_role("heading", name="Nothing here yet").wait_for()
-    expect(page.get_by_text("Choose a folder")).to_be_visible()
-    expect(page.locator(".skeleton:visible")).to_have_count(0)
-    page.get_by_text(f"Project {EVIL}").wait_for()
+def test_nothing_yet_says_what_to_do(bare):
+    pretend(bare, [])
+    bare.goto("/")
+    bare.get_by_role("heading", name="Nothing here yet").wait_for()
+    expect(bare.get_by_text("Choose a folder")).to_be_visible()
+    expect(bare.locator(".skeleton:visible")).to_have_count(0)
+    bare.get_by_text(f"Project {EVIL}").wait_for()
 
 
-def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card(page):
+def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card(bare):
     """Each card comes as it is made; the project's name, which never comes, holds nothing up."""
     tokens, held = [], []
-    pretend(page, [])
-    page.route("**/v1/project", lambda route: None)
+    pretend(bare, [])
+    bare.route("**/v1/project", lambda route: None)
 
     def make(route):
         tokens.append(route.request.headers["idempotency-key"])
@@ -143,22 +150,22 @@ def test_the_sample_takes_one_click_after_which_the_keyboard_goes_on_at_its_card
         else:
             route.fulfill(status=201, json=capture(1) | {"name": "owl"})
 
-    page.route("**/v1/samples/**", make)
-    page.goto("/")
-    page.get_by_role("button", name="Open the sample owl").click()
-    page.locator(".card a", has_text="owl").wait_for()
-    expect(page.locator("#sample")).to_be_disabled()
-    seen(page, lambda: held, "the environment is not asked for")
+    bare.route("**/v1/samples/**", make)
+    bare.goto("/")
+    bare.get_by_role("button", name="Open the sample owl").click()
+    bare.locator(".card a", has_text="owl").wait_for()
+    expect(bare.locator("#sample")).to_be_disabled()
+    seen(bare, lambda: held, "the environment is not asked for")
     held[0].fulfill(status=201, json=capture(2) | {"id": f"env_{2:020d}", "name": "sky", "facts": {}})
-    page.locator(".card", has_text="sky").wait_for()
-    page.wait_for_function("() => document.activeElement.closest('.card') !== null && !document.getElementById('sample').disabled")
+    bare.locator(".card", has_text="sky").wait_for()
+    bare.wait_for_function("() => document.activeElement.closest('.card') !== null && !document.getElementById('sample').disabled")
     assert len(set(tokens)) == len(tokens) == 2
-    page.get_by_role("button", name="Close", exact=True).click()
-    expect(page.locator("#drop")).to_be_hidden()
-    expect(page.locator("#add")).to_be_focused()
-    with page.expect_file_chooser():
-        page.get_by_role("button", name="Add a folder").click()
-    expect(page.locator("#drop")).to_be_visible()
+    bare.get_by_role("button", name="Close", exact=True).click()
+    expect(bare.locator("#drop")).to_be_hidden()
+    expect(bare.locator("#add")).to_be_focused()
+    with bare.expect_file_chooser():
+        bare.get_by_role("button", name="Add a folder").click()
+    expect(bare.locator("#drop")).to_be_visible()
 
 
 @pytest.mark.long

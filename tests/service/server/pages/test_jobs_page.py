@@ -25,10 +25,9 @@ JOB_MS = 120_000
 
 
 @pytest.fixture(scope="session")
-def capture(server) -> str:
+def capture(server, client) -> str:
     """A small capture, registered and ready."""
-    with server.client() as client:
-        return admitted(server, client, SAMPLES / "lambert")["id"]
+    return admitted(server, client, SAMPLES / "lambert")["id"]
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_jobs_are_chosen_by_what_asks_for_them_and_how_they_are(page, solved):
     expect(page.locator("#jobs .state:not(.failed)")).to_have_count(0)
 
 
-def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot_apply(server, page, capture, patterns):
+def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot_apply(client, page, capture, patterns):
     page.goto(f"/captures/{patterns}")
     page.get_by_role("heading", name="<b>stripes", level=1).wait_for()
     await_offers(page, {kind for kind, what in BEGIN_WITH.items() if "pattern" in what})
@@ -80,39 +79,37 @@ def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot
     expect(page.locator("#next :is(.button, button):not(.quiet):visible")).to_have_count(1)  # one that stands out
     page.get_by_role("button", name=TITLES["pipeline"]).click()
     page.wait_for_url("**/object/cap_*")
-    with server.client() as client:
-        jobs = client.get("/v1/jobs", params={"kind": "pipeline", "limit": 500}).json()["jobs"]
-        job, = [each["id"] for each in jobs if each["request"]["capture"] == capture]
-        page.goto(f"/jobs/{job}")  # on the page of the object its line goes when it has succeeded
-        expect(page.locator(f"#request dd a[href='/captures/{capture}']")).to_be_visible()
-        page.locator("#usual-part > summary").click()
-        expect(page.locator("#usual dt").first).to_be_visible()
-        request = page.locator("#request, #usual").all_inner_texts()
-        assert "[object" not in "".join(request) and "{" not in "".join(request)
-        names = page.locator("#request dt, #usual dt").all_inner_texts()
-        assert len(names) == len(set(names)) and {"Capture", "Clip negative", "Textures"} <= set(names)
-        client.post(f"/v1/jobs/{job}/cancel")
+    jobs = client.get("/v1/jobs", params={"kind": "pipeline", "limit": 500}).json()["jobs"]
+    job, = [each["id"] for each in jobs if each["request"]["capture"] == capture]
+    page.goto(f"/jobs/{job}")  # on the page of the object its line goes when it has succeeded
+    expect(page.locator(f"#request dd a[href='/captures/{capture}']")).to_be_visible()
+    page.locator("#usual-part > summary").click()
+    expect(page.locator("#usual dt").first).to_be_visible()
+    request = page.locator("#request, #usual").all_inner_texts()
+    assert "[object" not in "".join(request) and "{" not in "".join(request)
+    names = page.locator("#request dt, #usual dt").all_inner_texts()
+    assert len(names) == len(set(names)) and {"Capture", "Clip negative", "Textures"} <= set(names)
+    client.post(f"/v1/jobs/{job}/cancel")
 
 
-def test_a_deletion_is_undone_and_done(server, page):
+def test_a_deletion_is_undone_and_done(server, client, page):
     """Time is the page's own clock, which the test stops and moves."""
-    with server.client() as client:
-        capture = admitted(server, client, SAMPLES / "lambert")["id"]
-        page.clock.install()
-        page.goto(f"/captures/{capture}")
-        page.locator("#frames canvas").first.wait_for(timeout=JOB_MS)  # a capture that a job still reads is not deleted
-        await_whole(page)
-        page.clock.pause_at(page.evaluate("Date.now()") + 30_000)  # later than now, however slow the machine is
-        for _ in range(2):
-            page.get_by_role("button", name="Delete").click()
-            page.get_by_role("alert").get_by_text("lambert is deleted in 8 s.").wait_for()
-            page.get_by_role("button", name="Undo").click()
-            page.clock.run_for(20_000)
-        assert client.get(f"/v1/captures/{capture}").status_code == 200
+    capture = admitted(server, client, SAMPLES / "lambert")["id"]
+    page.clock.install()
+    page.goto(f"/captures/{capture}")
+    page.locator("#frames canvas").first.wait_for(timeout=JOB_MS)  # a capture that a job still reads is not deleted
+    await_whole(page)
+    page.clock.pause_at(page.evaluate("Date.now()") + 30_000)  # later than now, however slow the machine is
+    for _ in range(2):
         page.get_by_role("button", name="Delete").click()
-        page.clock.run_for(9_000)
-        page.wait_for_url("**/captures")
-        assert client.get(f"/v1/captures/{capture}").status_code == 404
+        page.get_by_role("alert").get_by_text("lambert is deleted in 8 s.").wait_for()
+        page.get_by_role("button", name="Undo").click()
+        page.clock.run_for(20_000)
+    assert client.get(f"/v1/captures/{capture}").status_code == 200
+    page.get_by_role("button", name="Delete").click()
+    page.clock.run_for(9_000)
+    page.wait_for_url("**/captures")
+    assert client.get(f"/v1/captures/{capture}").status_code == 404
 
 
 def opened_form(page, title: str, options: bool = True):
@@ -142,7 +139,7 @@ def slow_job(client, capture: str, sky: str) -> str:
         "frames": "1-300", "spin_degrees": 360}}).raise_for_status().json()["id"]
 
 
-def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capture):
+def test_a_form_submits_a_job_that_is_followed_to_its_results(client, page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
     form.get_by_label("Method").select_option("lambert")
@@ -150,10 +147,9 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     job = submitted(page)
     page.locator(".state.succeeded").wait_for(timeout=JOB_MS)
     page.locator("#results").get_by_text("maps.exr").wait_for()
-    with server.client() as client:
-        found = client.get(f"/v1/jobs/{job}").json()
-        assert (found["request"]["options"]["method"], found["priority"]) == ("lambert", 60)
-        report = client.get(f"/v1/jobs/{job}/results/report.json").json()
+    found = client.get(f"/v1/jobs/{job}").json()
+    assert (found["request"]["options"]["method"], found["priority"]) == ("lambert", 60)
+    report = client.get(f"/v1/jobs/{job}/results/report.json").json()
     expect(page.locator("#stages tbody td:first-child")).to_have_text(list(report["timings_s"]))
     page.locator("summary", has_text="Log").click()
     page.locator("#log li", has_text="attempt 1: succeeded").wait_for()
@@ -191,7 +187,7 @@ def test_forms_of_several_captures_and_images(page, capture, patterns):
     form.locator(".fault", has_text="Images: ").wait_for()
 
 
-def test_a_form_can_be_sent_before_its_lists_have_come_and_what_is_chosen_meanwhile_stays(server, page, capture):
+def test_a_form_can_be_sent_before_its_lists_have_come_and_what_is_chosen_meanwhile_stays(page, capture):
     """The page's capture is in the form at once; another one that is chosen while the list still comes is not put back."""
     first, second = ({"id": f"cap_{each * 20}", "name": each, "state": "ready"} for each in "ab")
     held = []
@@ -216,7 +212,7 @@ def test_a_form_can_be_sent_before_its_lists_have_come_and_what_is_chosen_meanwh
     expect(command).to_contain_text(f" solve {first['id']}")
 
 
-def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
+def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(client, page, capture, sky):
     """Both are run as they are shown, and make the same request as the form."""
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Relight frames")
@@ -233,8 +229,7 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     assert done.returncode == 0, done.stderr
     by_command = re.search(r"job_\w+", done.stdout)[0]
     by_curl = json.loads(subprocess.run(shlex.split(curl), capture_output=True, text=True, timeout=60, check=True).stdout)["id"]
-    with server.client() as client:
-        requests = [client.get(f"/v1/jobs/{each}").json()["request"] for each in (job, by_command, by_curl)]
+    requests = [client.get(f"/v1/jobs/{each}").json()["request"] for each in (job, by_command, by_curl)]
     assert requests[0] == requests[1] == requests[2]
     assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
 
@@ -254,28 +249,27 @@ def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, c
     page.locator("#state").get_by_text("attempt 2").wait_for(timeout=JOB_MS)
 
 
-def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
-    with server.client() as client:
-        job = slow_job(client, capture, sky)
-        page.goto(f"/jobs/{job}")
-        page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
-        page.get_by_role("button", name="Cancel").click()
-        page.locator(".state.cancelled").wait_for()
-        page.get_by_role("button", name="Resume").click()
-        page.locator("#state").get_by_text("attempt 2").wait_for()
-        page.get_by_role("button", name="Cancel").click()
-        page.locator(".state.cancelled").wait_for()
-        server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
-        page.clock.install()
-        page.get_by_role("button", name="Delete").click()
-        page.clock.run_for(9_000)  # in which it can be undone
-        page.wait_for_url("**/jobs")
-        assert client.get(f"/v1/jobs/{job}").status_code == 404
+def test_a_job_is_cancelled_and_resumed(server, client, page, capture, sky):
+    job = slow_job(client, capture, sky)
+    page.goto(f"/jobs/{job}")
+    page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".state.cancelled").wait_for()
+    page.get_by_role("button", name="Resume").click()
+    page.locator("#state").get_by_text("attempt 2").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".state.cancelled").wait_for()
+    server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
+    page.clock.install()
+    page.get_by_role("button", name="Delete").click()
+    page.clock.run_for(9_000)  # in which it can be undone
+    page.wait_for_url("**/jobs")
+    assert client.get(f"/v1/jobs/{job}").status_code == 404
 
 
-def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
+def test_a_lost_connection_is_said_and_regained(server, client, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
-    with server.client() as client, tcp_proxy(urlsplit(server.url).port) as way:
+    with tcp_proxy(urlsplit(server.url).port) as way:
         job = slow_job(client, capture, sky)
         page = new_context(browser, base_url=way.url).new_page()
         page.goto(f"/jobs/{job}")
@@ -289,12 +283,11 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
         page.close()
 
 
-def test_the_list_follows_all_jobs(server, page, capture):
+def test_the_list_follows_all_jobs(client, page, capture):
     page.goto("/jobs")
-    with server.client() as client:
-        request = {"kind": "solve", "capture": capture, "name": "seen", "options": {"method": "lambert"}}
-        job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
-        row = page.locator("#jobs tr", has_text=job)
-        row.locator(".state.succeeded").wait_for(timeout=JOB_MS)
-        client.delete(f"/v1/jobs/{job}").raise_for_status()
-        row.wait_for(state="detached")
+    request = {"kind": "solve", "capture": capture, "name": "seen", "options": {"method": "lambert"}}
+    job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
+    row = page.locator("#jobs tr", has_text=job)
+    row.locator(".state.succeeded").wait_for(timeout=JOB_MS)
+    client.delete(f"/v1/jobs/{job}").raise_for_status()
+    row.wait_for(state="detached")

@@ -13,16 +13,15 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def shown(server, material, sky) -> dict[str, str]:
+def shown(server, client, material, sky) -> dict[str, str]:
     """The addresses of pages by the names of their pictures, of a capture that is solved twice, exported and relit, and of a depth."""
-    with server.client() as client:
-        made = done(server, client, {"kind": "pipeline", "capture": material.capture, "environment": sky, "solve": {"method": "robust"},
-                                     "relight": {"frames": "1-12", "spin_degrees": 360}})
-        done(server, client, {"kind": "view", "capture": material.capture, "maps": made})
-        scanned = admitted(server, client, SAMPLES / "rig")["id"]
-        measured = done(server, client, {"kind": "depth", "capture": scanned})
-        for maps in ({}, {"maps": measured}):
-            done(server, client, {"kind": "view", "capture": scanned, **maps})
+    made = done(server, client, {"kind": "pipeline", "capture": material.capture, "environment": sky, "solve": {"method": "robust"},
+                                 "relight": {"frames": "1-12", "spin_degrees": 360}})
+    done(server, client, {"kind": "view", "capture": material.capture, "maps": made})
+    scanned = admitted(server, client, SAMPLES / "rig")["id"]
+    measured = done(server, client, {"kind": "depth", "capture": scanned})
+    for maps in ({}, {"maps": measured}):
+        done(server, client, {"kind": "view", "capture": scanned, **maps})
     page = material.pages["object"]
     return material.pages | {
         "captures": "/captures", "jobs": "/jobs", "job": f"/jobs/{made}", "maps": f"{material.pages['maps']}#layer=normal&with=roughness",
@@ -72,8 +71,7 @@ def test_every_page_shows_the_sample(browser, server, shown, owl, solved, sky, t
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.75, 0.3), (0.3, 0.8)])
 def test_the_light_dragged_over_the_sample_shows_what_the_batch_renders(page, owl, tmp_path, place):
     """The sample has highlights and shadows as sharp as its pixels, and the light is as small as the sun."""
-    page.goto(owl.pages["light"])
-    owl.wait_for_content(page, "light")
+    owl.open(page, "light")
     box = page.locator("canvas.picture").bounding_box()
     page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
     page.mouse.down()

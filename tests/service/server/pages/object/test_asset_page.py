@@ -38,10 +38,9 @@ def page(small_page):
 
 
 @pytest.fixture(scope="module")
-def exported(server, solved) -> dict[str, str]:
+def exported(server, client, solved) -> dict[str, str]:
     """The jobs that exported the solved capture, by format."""
-    with server.client() as client:
-        return {form: done(server, client, {"kind": "export", "maps": solved.solve, "format": form}) for form in ("usdz", "glb", "usda")}
+    return {form: done(server, client, {"kind": "export", "maps": solved.solve, "format": form}) for form in ("usdz", "glb", "usda")}
 
 
 @pytest.fixture(scope="module")
@@ -150,11 +149,10 @@ def test_an_environment_lights_from_where_it_is_bright_and_turns_as_in_relit_rel
     assert shift_of_light(asset)[0] > SHIFT
 
 
-def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
-    with solved.server.client() as client:
-        view = next(job["id"] for job in client.get("/v1/jobs", params={"kind": "view", "limit": 500}).json()["jobs"]
-                    if job["request"]["capture"] == solved.capture)
-        frames = client.get(f"/v1/jobs/{view}/results/view.json").json()["frames"]
+def test_the_lights_of_the_rig_are_shown_and_light_the_asset(client, asset, solved):
+    view = next(job["id"] for job in client.get("/v1/jobs", params={"kind": "view", "limit": 500}).json()["jobs"]
+                if job["request"]["capture"] == solved.capture)
+    frames = client.get(f"/v1/jobs/{view}/results/view.json").json()["frames"]
     lights = [index for index, frame in enumerate(frames) if frame["kind"] == "light" and frame["direction"] is not None]
     assert len(lights) > 0
     expect(asset.locator("select").first.locator("option")).to_have_count(2 + len(lights))

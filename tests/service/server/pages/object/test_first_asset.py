@@ -113,7 +113,7 @@ def test_the_keyboard_alone_leads_from_a_folder_to_an_asset(counting, tmp_path):
     assert page.evaluate("sessionStorage.presses") is None
 
 
-def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting, server, tmp_path):
+def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting, client, tmp_path):
     """The folder is chosen, which takes a click more than to drop it."""
     page, folder = counting, write_photographs(tmp_path / tmp_path.name, table=False)
     opened(page)
@@ -133,10 +133,9 @@ def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting
     assert picture(page).std() > 0.05
     page.get_by_text("those that the solve has found").wait_for()
     capture = page.url.partition("#")[0].rpartition("/")[2]
-    with server.client() as client:
-        made = [job for job in client.get("/v1/jobs", params={"limit": 50}).json()["jobs"]
-                if job["request"].get("capture") == capture and job["request"]["kind"] == "pipeline"]
-        report = client.get(f"/v1/jobs/{made[0]['id']}/results/report.json").json()
+    made = [job for job in client.get("/v1/jobs", params={"limit": 50}).json()["jobs"]
+            if job["request"].get("capture") == capture and job["request"]["kind"] == "pipeline"]
+    report = client.get(f"/v1/jobs/{made[0]['id']}/results/report.json").json()
     assert made[0]["request"]["solve"]["lights"] == "unknown" and len(report["found"]["unknown_lights"]["directions"]) == 32
     page.goto(f"/captures/{capture}")
     page.locator("#work:not([hidden])").wait_for()

@@ -37,29 +37,26 @@ ImageBitmap.prototype.close = function () { openBitmaps -= 1; close.call(this); 
 
 
 @pytest.fixture(scope="module")
-def relit(server, solved, sky) -> str:
-    with server.client() as client:
-        return done(server, client, {"kind": "relight", "capture": solved.capture, "environment": sky,
-                                     "name": "<img src=x onerror=alert(1)>", "options": {"frames": f"1-{FRAMES}", "spin_degrees": 90}})
+def relit(server, client, solved, sky) -> str:
+    return done(server, client, {"kind": "relight", "capture": solved.capture, "environment": sky,
+                                 "name": "<img src=x onerror=alert(1)>", "options": {"frames": f"1-{FRAMES}", "spin_degrees": 90}})
 
 
-def last_frame_of(video: Path, server, job: str) -> int:
+def last_frame_of(video: Path, client, job: str) -> int:
     """The number of the frame that is most like the last picture of a video."""
     recording, last = cv2.VideoCapture(str(video)), None
     while (read := recording.read())[0]:
         last = read[1].astype(np.float32)
-    with server.client() as client:
-        names = [f"/v1/jobs/{job}/pictures/frame.{number:04}.exr" for number in range(1, FRAMES + 1)]
-        frames = [cv2.imdecode(np.frombuffer(client.get(name).content, np.uint8), cv2.IMREAD_COLOR) for name in names]
+    names = [f"/v1/jobs/{job}/pictures/frame.{number:04}.exr" for number in range(1, FRAMES + 1)]
+    frames = [cv2.imdecode(np.frombuffer(client.get(name).content, np.uint8), cv2.IMREAD_COLOR) for name in names]
     return 1 + int(np.argmin([np.abs(last - frame).mean() for frame in frames]))
 
 
-def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved, relit, tmp_path):
-    with server.client() as client:
-        answer = client.get(f"/v1/jobs/{relit}/pictures/frame.0001.exr").raise_for_status()
-        assert client.get(f"/v1/jobs/{relit}/pictures/frame.0001.exr", headers={"If-None-Match": answer.headers["ETag"]}).status_code == 304
-        refused(client.get(f"/v1/jobs/{solved.solve}/pictures/report.json"), 422, "report.json is no EXR file")
-        refused(client.get(f"/v1/jobs/{relit}/pictures/frame.9.exr"), 404, "has no such result")
+def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(client, solved, relit, tmp_path):
+    answer = client.get(f"/v1/jobs/{relit}/pictures/frame.0001.exr").raise_for_status()
+    assert client.get(f"/v1/jobs/{relit}/pictures/frame.0001.exr", headers={"If-None-Match": answer.headers["ETag"]}).status_code == 304
+    refused(client.get(f"/v1/jobs/{solved.solve}/pictures/report.json"), 422, "report.json is no EXR file")
+    refused(client.get(f"/v1/jobs/{relit}/pictures/frame.9.exr"), 404, "has no such result")
     assert answer.headers["Content-Type"] == "image/jpeg"
     (tmp_path / "frame.jpg").write_bytes(io.BytesIO(answer.content).getvalue())
     shown = oiio.ImageBuf(str(tmp_path / "frame.jpg")).get_pixels(oiio.FLOAT)
@@ -124,7 +121,7 @@ def test_what_was_taken_for_granted_is_no_warning_of_frames(page, solved, relit)
     expect(page.locator("[data-shows=frames] .warnings")).not_to_contain_text("no lens")
 
 
-def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
+def test_frames_are_played_recorded_and_saved(page, client, solved, relit):
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     page.add_init_script(COUNT_BITMAPS)
     page.goto(f"{solved.pages['object']}#mode=frames")
@@ -132,8 +129,7 @@ def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
     expect(page.locator(".filmstrip li")).to_have_count(FRAMES)
     expect(page.locator("[data-shows=frames] img")).to_have_count(0)
     expect(page.get_by_label("Frames of").locator("option").first).to_contain_text("<img")
-    with server.client() as client:
-        log = [entry["text"] for entry in client.get(f"/v1/jobs/{relit}/log").json()["entries"]]
+    log = [entry["text"] for entry in client.get(f"/v1/jobs/{relit}/log").json()["entries"]]
     warnings = [text.removeprefix("warning: ") for text in log if text.startswith("warning: ")]
     assert any("of the light of frame" in each for each in warnings)  # from where no lamp of the sample stands
     expect(page.locator("[data-shows=frames] .warnings li")).to_have_text(warnings)
@@ -147,7 +143,7 @@ def test_frames_are_played_recorded_and_saved(page, server, solved, relit):
     with page.expect_download() as download:
         page.get_by_role("button", name="Save a video").click()
     assert download.value.path().read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
-    assert last_frame_of(download.value.path(), server, relit) == FRAMES
+    assert last_frame_of(download.value.path(), client, relit) == FRAMES
     page.wait_for_function("() => openBitmaps === 0")
     assert 0 < page.evaluate("() => mostOpen") <= MOST_OPEN
     page.get_by_text(f"All {FRAMES} frames as EXR").click()

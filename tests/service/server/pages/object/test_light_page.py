@@ -22,8 +22,7 @@ CAPTURED = 7
 
 @pytest.fixture
 def opened(page, solved):
-    page.goto(solved.pages["light"])
-    solved.wait_for_content(page, "light")
+    solved.open(page, "light")
     return page
 
 
@@ -63,13 +62,12 @@ def test_coefficient_images_that_come_late_are_counted_beside_the_rest_of_the_pa
     expect(page.locator(".coming")).to_have_count(0)
 
 
-def test_a_photograph_leads_to_it_beside_the_light(page, solved):
+def test_a_photograph_leads_to_it_beside_the_light(client, page, solved):
     page.goto(f"{solved.pages['object']}#mode=photographs")
     page.locator("[data-shows=photographs] figure a").nth(CAPTURED).click()
     solved.wait_for_content(page, "light")
     expect(page.get_by_label("Photograph to compare with")).to_have_value(str(CAPTURED))
-    with solved.server.client() as client:
-        frame = prepared_view(client, solved.capture)["frames"][CAPTURED]
+    frame = prepared_view(client, solved.capture)["frames"][CAPTURED]
     assert np.allclose(page.evaluate("relit.state().light.direction"), frame["direction"], atol=2e-3)  # of three decimals
 
 
@@ -91,10 +89,9 @@ def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(ope
     opened.locator("canvas.picture:not(.hatched)").wait_for()
 
 
-def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solved):
+def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(client, opened, solved):
     """The error is the one that was measured when the basis was made; the rate appears when something moves."""
-    with solved.server.client() as client:
-        relight = prepared_view(client, solved.capture)["relight"]
+    relight = prepared_view(client, solved.capture)["relight"]
     opened.locator(".figures > summary").click()
     expect(opened.locator(".figures")).to_contain_text(f"under {relight['held_out']['key_lights']} lights that the basis was not made from")
     expect(opened.locator(".figures p").first).to_be_visible()
@@ -117,8 +114,7 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
       const next = () => (left-- > 0 ? requestAnimationFrame(next) : done(drawn));
       next();
     })"""
-    page.goto(solved.pages["light"])
-    solved.wait_for_content(page, "light")
+    solved.open(page, "light")
     before = page.evaluate(frames)
     assert before > 0 and page.evaluate(frames) == before
     page.get_by_label("Exposure in stops").fill("1")
@@ -146,17 +142,16 @@ def test_arrow_keys_move_the_light(page, solved):
     assert np.degrees(np.arccos(np.dot(before, after))) == pytest.approx(5, abs=1.5) and after[0] > before[0]
 
 
-def test_a_photograph_is_compared(opened, solved, tmp_path):
+def test_a_photograph_is_compared(client, opened, solved, tmp_path):
     """At the left end of the wipe, all of the picture is the photograph, as its coefficient images keep it."""
     opened.get_by_label("Photograph to compare with").select_option(str(CAPTURED))
     opened.get_by_label("Where the two pictures meet").fill("0")
     shown = picture(opened)
     exposure = opened.evaluate("() => relit.state().exposure")
-    with solved.server.client() as client:
-        frames = prepared_view(client, solved.capture)["frames"]
-        image = [frame["image"] for frame in frames if frame["direction"] is not None][CAPTURED]
-        keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
-        job = done(solved.server, client, {"kind": "relight", "capture": solved.capture, "keys": keys, "options": {"exposure": exposure}})
+    frames = prepared_view(client, solved.capture)["frames"]
+    image = [frame["image"] for frame in frames if frame["direction"] is not None][CAPTURED]
+    keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
+    job = done(solved.server, client, {"kind": "relight", "capture": solved.capture, "keys": keys, "options": {"exposure": exposure}})
     channels, _ = exr.read(solved.result(job, "frame.0001.exr", tmp_path))
     assert_same(shown, srgb(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
@@ -170,8 +165,7 @@ def test_without_webgl_it_is_said(page, solved):
 
 @pytest.mark.parametrize("turn", ["0", "130"])
 def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path, turn):
-    page.goto(solved.pages["light"])
-    solved.wait_for_content(page, "light")
+    solved.open(page, "light")
     page.get_by_label("On", exact=True).uncheck()
     page.get_by_label("Environment map").select_option(sky)
     page.locator("canvas.preview").wait_for(timeout=60_000)
@@ -182,16 +176,16 @@ def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path
 
 
 @pytest.fixture(scope="module")
-def aces(server, tmp_path_factory) -> Solved:
+def aces(server, client, tmp_path_factory) -> Solved:
     """The sample as a capture whose colours are ACEScg."""
     folder = shutil.copytree(SAMPLES / "lambert", tmp_path_factory.mktemp("aces") / "aces")
     edit_manifest(folder, name="aces", color_space="lin_ap1_scene")
     for image in folder.glob("*.exr"):
         channels, _ = exr.read(image)
         exr.write(image, channels, color_space="lin_ap1_scene", metadata={})
-    with Client(server.url) as uploading, server.client() as client:
+    with Client(server.url) as uploading:
         capture = uploading.captures.upload(folder).id
-        done(server, client, {"kind": "view", "capture": capture})
+    done(server, client, {"kind": "view", "capture": capture})
     return Solved(server, capture, "")
 
 
@@ -211,8 +205,7 @@ def wide_skies(server, tmp_path_factory) -> dict[str, str]:
 def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_skies, tmp_path, request):
     """A key light is chosen in the colours of the screen, and maps and captures have colour spaces of their own."""
     shown_capture = request.getfixturevalue(capture)
-    page.goto(shown_capture.pages["light"])
-    shown_capture.wait_for_content(page, "light")
+    shown_capture.open(page, "light")
     page.get_by_label("Size of the light in degrees").fill("10")
     page.locator("input[type=color]").fill("#ff4020")
     page.get_by_label("Environment map").select_option(wide_skies[capture])

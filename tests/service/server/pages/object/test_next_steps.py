@@ -7,7 +7,7 @@ from tests.service.server.pages.conftest import alter, expect, seen
 pytestmark = pytest.mark.long
 
 
-def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_page, solved):
+def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(client, small_page, solved):
     """The capture is being checked at first. A button that asks for a job rests while such a job is under way."""
     page, states, submitted = small_page, ["checking", "ready"], []
 
@@ -15,8 +15,7 @@ def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_pa
         submitted.append(route.request.post_data_json)
         route.fulfill(status=202, json=waiting)
 
-    with solved.server.client() as client:
-        job = client.get(f"/v1/jobs/{solved.solve}").json()
+    job = client.get(f"/v1/jobs/{solved.solve}").json()
     waiting = {**job, "state": "queued", "request": {"kind": "pipeline", "capture": solved.capture}}
     alter(page, "**/v1/jobs?kind=view&limit=500&state=succeeded&state=queued&state=running", lambda found: found | {
         "jobs": [{**job, "state": "queued"} for job in found["jobs"]]})
@@ -40,7 +39,7 @@ def test_a_capture_can_be_worked_on_while_its_view_waits_for_other_jobs(small_pa
     expect(page.locator("#facts")).to_be_visible()
 
 
-def test_maps_are_exported_without_another_solve(small_page, solved):
+def test_maps_are_exported_without_another_solve(client, small_page, solved):
     page, submitted = small_page, []
 
     def submit(route):
@@ -53,7 +52,6 @@ def test_maps_are_exported_without_another_solve(small_page, solved):
     page.goto(f"{solved.pages['object']}#mode=photographs")
     page.get_by_role("button", name="Export an asset").click()
     newest = seen(page, lambda: submitted, "nothing is submitted")[0]
-    with solved.server.client() as client:
-        solve = client.get(f"/v1/jobs/{newest['maps']}").json()["request"]
+    solve = client.get(f"/v1/jobs/{newest['maps']}").json()["request"]
     assert newest == {"kind": "export", "maps": newest["maps"]} and (solve["kind"], solve["capture"]) == ("solve", solved.capture)
     expect(page.get_by_role("button", name="Make an asset")).to_be_hidden()

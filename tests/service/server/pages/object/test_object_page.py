@@ -13,11 +13,10 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def made(server, solved) -> Solved:
+def made(server, client, solved) -> Solved:
     """The small sample, solved twice and exported."""
-    with server.client() as client:
-        other = done(server, client, {"kind": "solve", "capture": solved.capture, "name": "<i>other", "options": {"method": "robust"}})
-        done(server, client, {"kind": "export", "maps": other})
+    other = done(server, client, {"kind": "solve", "capture": solved.capture, "name": "<i>other", "options": {"method": "robust"}})
+    done(server, client, {"kind": "export", "maps": other})
     return solved
 
 
@@ -28,8 +27,7 @@ def mode(page, name: str, content: str) -> None:
 
 def test_the_modes_of_an_object_are_those_that_exist_and_stand_in_the_address(small_page, made):
     page = small_page
-    page.goto(made.pages["object"])
-    made.wait_for_content(page, "object")
+    made.open(page, "object")
     expect(page.locator("#modes button:not([data-mode=frames])")).to_have_text(["Light", "Maps", "3-D", "Photographs", "Compare"])
     for name in ("asset.usdz", "maps.exr"):
         expect(page.locator("#files").get_by_role("link", name=name, exact=True)).to_be_visible()
@@ -53,8 +51,7 @@ def test_back_and_forward_go_through_the_modes_as_they_were_left(small_page, mad
     page, errors = small_page, []
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.goto("/jobs")
-    page.goto(made.pages["object"])
-    made.wait_for_content(page, "object")
+    made.open(page, "object")
     page.get_by_label("Size of the light in degrees").fill("12")
     mode(page, "Maps", "[data-shows=maps] canvas.map")
     page.get_by_label("Layer", exact=True).select_option("normal")
@@ -104,9 +101,8 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
     expect(page.get_by_text("its view is being prepared")).to_be_hidden()
 
 
-def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(server, small_page, made):
-    with server.client() as client:
-        jobs = client.get("/v1/jobs", params={"limit": 500, "kind": "export"}).json()["jobs"]
+def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(client, small_page, made):
+    jobs = client.get("/v1/jobs", params={"limit": 500, "kind": "export"}).json()["jobs"]
     waiting = {**jobs[0], "state": "queued"}
     foreign = {**waiting, "id": "job_0123456789abcdefghjk", "request": {**waiting["request"], "maps": "job_x123456789abcdefghjk"}}
     page, listed = small_page, {"jobs": [waiting, foreign], "next": None}
@@ -131,8 +127,7 @@ def test_what_was_taken_for_granted_is_no_fault(page, made, mode):
 
 
 def test_every_slider_has_its_number(page, made):
-    page.goto(made.pages["light"])
-    made.wait_for_content(page, "light")
+    made.open(page, "light")
     page.get_by_label("Size of the light in degrees").fill("12.5")
     page.evaluate("relit.set([0.3, 0.1, 0.9])")
     expect(page.locator(".panel input[type=range]")).to_have_count(6)
@@ -212,8 +207,7 @@ def test_the_maps_of_any_solve_are_shown(page, made):
 
 
 def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):
-    page.goto(made.pages["light"])
-    made.wait_for_content(page, "light")
+    made.open(page, "light")
     page.get_by_label("Environment map").select_option(sky)
     page.locator("canvas.preview").wait_for()
     page.wait_for_function("() => relit.state().light === null")  # the environment is seen alone at first
@@ -261,15 +255,13 @@ def test_a_zoomed_picture_is_smooth_has_a_scale_bar_and_fills_the_screen(page, m
 
 def test_two_fingers_zoom_the_picture(browser, server, made):
     with opened_page(browser, base_url=server.url, has_touch=True, viewport={"width": 390, "height": 800}) as page:
-        page.goto(made.pages["light"])
-        made.wait_for_content(page, "light")
+        made.open(page, "light")
         spread_fingers(page.locator("canvas.picture"))
         page.wait_for_function("() => location.hash.includes('zoom=2')")
 
 
 def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
-    page.goto(made.pages["light"])
-    made.wait_for_content(page, "light")
+    made.open(page, "light")
     page.get_by_role("button", name="Add a note").click()
     expect(page.locator(".marking")).to_be_focused()
     page.keyboard.press("Enter")
@@ -308,8 +300,7 @@ def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
 
 
 def test_a_video_is_recorded_by_the_browser(page, made):
-    page.goto(made.pages["light"])
-    made.wait_for_content(page, "light")
+    made.open(page, "light")
     page.wait_for_function("() => globalThis.relit?.state().light")
     before = page.evaluate("relit.state().light.direction")
     with page.expect_download() as download:

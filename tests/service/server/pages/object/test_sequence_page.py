@@ -15,13 +15,12 @@ STEPS = 3
 
 
 @pytest.fixture(scope="module")
-def walk(server, tmp_path_factory) -> tuple[str, str]:
+def walk(server, client, tmp_path_factory) -> tuple[str, str]:
     """The capture of a sequence, and the job that solved it."""
     folder = tmp_path_factory.mktemp("walk")
     write_sequence(folder, [None] * STEPS, noise=0.01, size=16)
-    with server.client() as client:
-        capture = upload(server, client, files_of(folder))["id"]
-        return capture, done(server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
+    capture = upload(server, client, files_of(folder))["id"]
+    return capture, done(server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
 
 
 def test_the_maps_and_the_frames_of_each_step_are_looked_at(page, walk):
