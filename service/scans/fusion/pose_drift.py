@@ -15,6 +15,8 @@ LEAST_SIGMAS, EXPLAINED = 0.25, 0.95
 """RMS displacement of the drift, in median standard deviations of the comparison, and robust cost that it leaves of that without it, for it
 to be told: of right poses it is .01 and 1.00, where the second half of the scans lies elsewhere .23 and .96, and of a turntable with 24
 steps of .3 and 1 % more .41 and .93, 1.4 and .79."""
+MOST_READINGS = 500_000
+"""About as many readings are fitted; hundreds of scans have millions."""
 ROUNDS = 20
 """Rounds of reweighting of the fit, which begins with no motion and comes nearer to that of most readings by a third or more in each."""
 
@@ -39,6 +41,8 @@ class Drift(NamedTuple):
 def pose_drift(samples: list[Sample], readings: list[Readings]) -> Drift | None:
     """Return the motion by which each scan lies farther from the surface of the others than the scan before; None: there is none.
     `readings`: of each scan, as `misplaced.readings_of` returns them; the scans are in the order in which they were taken."""
+    every = 1 + sum(len(each.at) for each in readings) // MOST_READINGS
+    readings = [Readings(each.at[::every], each.distance[::every], each.expected[::every]) for each in readings]
     at, distance, expected = (np.concatenate([getattr(each, name) for each in readings]) for name in ("at", "distance", "expected"))
     if len(samples) < LEAST_SCANS or len(at) < LEAST_COMMON * len(samples):
         return None

@@ -42,7 +42,8 @@ def succeeded(server: Server, request: JobRequest, project: str = "default") -> 
     with server.database() as database:
         database.transact(lambda connection: jobs.insert(connection, project=project, request=request, finished=job))
     folder = server.data / layout.results(project, job)
-    folder.mkdir(parents=True)
+    for path in (*reversed(folder.parents), folder):
+        path.mkdir(mode=0o750, exist_ok=True)  # as the service makes them
     return folder
 
 
