@@ -66,7 +66,7 @@ def test_right_captures_raise_no_alarm(background, second, tmp_path):
 def test_few_photons_over_many_bins_show_no_pile_up(seed, tmp_path):
     """Three walls of one metre to four: what pile-up seems to explain scatters by fifteen, and rises with a pulse that is fitted to it."""
     random = np.random.default_rng(seed)
-    down, right = (np.mgrid[0:72, 0:96] - np.array([36, 48]).reshape(2, 1, 1) + 0.5) / 85
+    down, right = (np.mgrid[0:48, 0:64] - np.array([24, 32]).reshape(2, 1, 1) + 0.5) / 57
     depth = np.minimum(np.minimum(4.0, 1.1 / np.maximum(down, 0.01)), 1.4 / np.maximum(right, 0.01))
     range_m = depth * np.sqrt(right**2 + down**2 + 1)
     albedo = np.clip(0.45 + 0.5 * gaussian_filter(random.standard_normal(depth.shape), 3), 0.1, 0.9)
