@@ -236,7 +236,7 @@ def test_no_folder_holds_more_files_than_a_newcomer_can_scan():
 
 
 def test_no_cycles():
-    """Of modules, as they are loaded."""
+    """No module imports itself, by way of others, as it is loaded."""
     check_acyclic((found.importer, target) for found in imports() if not found.lazy and (target := module_of(found.target)) is not None)
 
 

@@ -199,11 +199,18 @@ def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, apart: 
     sigma = float(np.median(expected[seen][known[seen]]))
     place, normal = sample.points[seen] - sample.points[seen].mean(axis=0), sample.normals[seen]
     rows = np.concatenate([np.cross(place, normal), normal], axis=1) * ([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
-    fit = np.zeros(len(rows))
-    for _ in range(ROUNDS):
-        rest = np.abs(offset - fit)
-        weighted = rows / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)[:, None]
-        fit = rows @ (np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ offset))
+    fit = rows @ fitted_motion(rows, offset, ROUNDS)
     displacement = float(np.sqrt(np.mean(fit**2)))
     return Placing(int(seen.sum()), displacement, float(np.median(np.abs(offset))), sigma,
                    displacement > max(LARGEST_SIGMAS * sigma, voxel / 2))
+
+
+def fitted_motion(rows: np.ndarray, distance: np.ndarray, rounds: int) -> np.ndarray:
+    """Return the small motion [6] that explains distances [n] of points from other surfaces best, with Cauchy weights.
+    `rows`: [n, 6] how fast each distance grows with the motion. `rounds`: of reweighting, which begins with no motion."""
+    motion = np.zeros(rows.shape[1])
+    for _ in range(rounds):
+        rest = np.abs(distance - rows @ motion)
+        weighted = rows / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)[:, None]
+        motion = np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ distance)
+    return motion

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.scans.fusion.misplaced import LEAST_COMMON, UNDETERMINED, Readings, Sample
+from service.scans.fusion.misplaced import LEAST_COMMON, Readings, Sample, fitted_motion
 
 LEAST_SCANS = 4
 """Fewest scans that tell a drift from the displacement of one."""
@@ -53,11 +53,7 @@ def pose_drift(samples: list[Sample], readings: list[Readings]) -> Drift | None:
     extent = max(float(np.abs(place).max()), 1e-12)
     rows = steps[:, None] * np.concatenate([np.cross(place / extent, normals), normals], axis=1)
     spread = max(1.5 * float(np.median(np.abs(distance))), 1e-9)
-    motion = np.zeros(6)
-    for _ in range(ROUNDS):
-        rest = np.abs(distance - rows @ motion)
-        weighted = rows / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)[:, None]
-        motion = np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ distance)
+    motion = fitted_motion(rows, distance, ROUNDS)
     drifted = rows @ motion
     before, after = (np.log1p((rest / spread) ** 2).sum() for rest in (distance, distance - drifted))
     displacement = float(np.sqrt(np.mean(drifted**2)))
